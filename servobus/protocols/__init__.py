@@ -1,0 +1,1 @@
+"""FLOOR 1: the languages of the wire, sans-IO."""

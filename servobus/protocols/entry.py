@@ -1,0 +1,32 @@
+"""What a protocol folder offers to the floors above: the shape of a line of `table.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from servobus.protocols.base import Codec, Device, Driver
+from servobus.protocols.model import ServoModel
+from servobus.protocols.options import BusOptions
+
+
+@dataclass(frozen=True, slots=True)
+class ProtocolEntry:
+    """The parts of one protocol. `options` below is always an instance of its own options class."""
+
+    options: type[BusOptions]
+    """Its YAML keys."""
+    models: Callable[[Any, Path], Mapping[str, ServoModel]]
+    """(options, the config's folder) -> every model its servos name, by that name. Raises ConfigError."""
+    codec: Callable[[], Codec]
+    """For the master's end of the line."""
+    driver: Callable[[Any, Mapping[str, ServoModel]], Driver]
+    device_codec: Callable[[], Codec]
+    """For the devices' end of the line."""
+    devices: Callable[[Any, Mapping[str, ServoModel]], Sequence[Device]]
+    """The simulated halves of the bus's servos."""
+    baudrates: tuple[int, ...]
+    """Rates a scan tries, the likely ones first."""
+    scan_ids: range

@@ -1,0 +1,10 @@
+"""The protocols there are: one line each. Nothing outside this table and its own folder names a protocol."""
+
+from __future__ import annotations
+
+from servobus.protocols import sms
+from servobus.protocols.entry import ProtocolEntry
+
+PROTOCOLS: dict[str, ProtocolEntry] = {
+    "sms": sms.ENTRY,
+}
