@@ -118,6 +118,10 @@ class GoalExpired(ServobusError):
     """The goal's time to live passed before its first byte could leave. Nothing was sent."""
 
 
+class ActionWithheld(ServobusError):
+    """A confirmed group did not start, because not all of its servos were ready. What was armed has been disarmed."""
+
+
 class PartialFailure(ServobusError):
     """Some servos did it and some did not: `results` maps each name to its outcome or its error."""
 

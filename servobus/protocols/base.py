@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
@@ -83,6 +83,8 @@ class Request(ABC, Generic[R]):
     """Seconds of silence that must follow."""
     service_time: float = 0.0
     """Seconds the device may need beyond its usual delay (flash write, reboot)."""
+    partial: bool = False
+    """Fewer replies than due are a result too: the nodes that are missing become doubtful, the others are believed."""
 
     @abstractmethod
     def answers(self, reply: Any) -> bool:
@@ -236,8 +238,9 @@ class State:
 class Identity:
     """What a servo says of itself; None where the protocol does not tell."""
 
-    model_number: int | None = None
-    model_name: str | None = None
+    model: str | None = None
+    """Name of a model file that fits."""
+    product: str | None = None
     firmware: str | None = None
     mode: GoalKind | None = None
     energised: bool | None = None
@@ -301,13 +304,6 @@ class Poll:
     request: Callable[[Collection[int]], Request[dict[str, Update]] | None]
 
 
-@dataclass(slots=True)
-class Doubt:
-    """Why a node is not to be believed at once: the looks of the replies that may still be under way."""
-
-    outstanding: set[Hashable] = field(default_factory=set)
-
-
 class Driver(Protocol):
     """A protocol's verbs on one bus: what to say for each. Sans-IO; knows its servos by name and every node by id."""
 
@@ -315,8 +311,8 @@ class Driver(Protocol):
     def nodes(self) -> Mapping[str, int]:
         """Servo name to node."""
 
-    def kinds(self, servo: str) -> Collection[GoalKind]:
-        """The goals this servo's model can do."""
+    def step(self, servo: str) -> float:
+        """The size of one raw step in the servo's unit."""
 
     def ping(self, node: int) -> Request[int | None]:
         """Is it there? Its status byte, if it has one."""
@@ -324,33 +320,45 @@ class Driver(Protocol):
     def unused(self) -> Request[Any]:
         """A question nobody answers, to hear whether the line echoes."""
 
-    def recover(self, node: int, avoid: Collection[Hashable], enabled: bool) -> Plan[bool]:
-        """Fence: ask what cannot be mistaken for any reply in `avoid`. True: the node still is as `enabled` left it;
-        False: it lost what enable() wrote, so it has restarted."""
+    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+        """Fence: ask what cannot be mistaken for any reply in `avoid` (oldest first). False: a servo of the node lost
+        what enable() wrote, so it has restarted (asked only when `enabled`)."""
 
-    def identify(self, servo: str) -> Plan[Identity]: ...
+    def inspect(self, node: int) -> Plan[Identity]:
+        """Who is there, whether configured or not."""
 
-    def read_state(self, servo: str) -> Request[dict[str, Update]]: ...
+    def identify(self, servo: str) -> Plan[Identity]:
+        """Who is there, and whether it fits the config. Learns what the other verbs need to know; writes nothing."""
 
-    def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]: ...
+    def read_state(self, servo: str) -> Request[dict[str, Update]]:
+        """Everything `State` can hold, by servo name."""
 
-    def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]: ...
+    def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
+        """The fewest reads that keep every servo's state fresh at these rates (Hz)."""
 
-    def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]: ...
+    def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
+        """Physical value, or the integer with `raw`. Raises UnknownName, NotSupported."""
+
+    def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:
+        """Write and confirm; the value then in the register. Raises LimitError, UnknownName, NotSupported at once."""
 
     def enable(self, servo: str) -> Plan[float | None]:
         """Goal := present, then torque on; the present position, in the servo's unit."""
 
-    def disable(self, servo: str) -> Plan[StopReport]: ...
+    def disable(self, servo: str) -> Plan[StopReport]:
+        """Torque off, confirmed."""
 
-    def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]: ...
+    def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
+        """The shortest way to stillness: first everything that can be written at once, then what needs a question."""
 
-    def check_goal(self, servo: str, goal: Goal) -> None:
+    def check_goal(self, goal: ServoGoal) -> None:
         """Raise LimitError or NotSupported for what the model or the wire cannot carry."""
 
-    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool, on_partial: str) -> Sequence[GoalTurn]: ...
+    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
+        """The fewest turns that carry these goals; with `together` one turn. Raises NotSupported."""
 
-    def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]: ...
+    def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
+        """The words for a health byte."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,6 +368,8 @@ class DeviceReply:
     data: bytes
     delay: float = 0.0
     slot: int = 0
+    late: float = 0.0
+    """More delay, that of a fault: it stays even on a line whose bytes take no time."""
 
 
 class Device(Protocol):

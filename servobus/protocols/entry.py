@@ -22,10 +22,10 @@ class ProtocolEntry:
     """(options, the config's folder) -> every model its servos name, by that name. Raises ConfigError."""
     codec: Callable[[], Codec]
     """For the master's end of the line."""
-    driver: Callable[[Any, Mapping[str, ServoModel]], Driver]
+    driver: Callable[[Any, Mapping[str, Any]], Driver]
     device_codec: Callable[[], Codec]
     """For the devices' end of the line."""
-    devices: Callable[[Any, Mapping[str, ServoModel]], Sequence[Device]]
+    devices: Callable[[Any, Mapping[str, Any]], Sequence[Device]]
     """The simulated halves of the bus's servos."""
     baudrates: tuple[int, ...]
     """Rates a scan tries, the likely ones first."""

@@ -111,6 +111,12 @@ class ServoModel(Data):
     status_bits: dict[Annotated[int, Field(ge=0, le=31)], str] = {}
     model_numbers: dict[int, str] = {}
 
+    @property
+    def reach(self) -> dict[str, tuple[float, float]]:
+        """What goals can carry, least and greatest: position (raw steps), speed (steps/s), acceleration (steps/s^2), torque_limit
+        (%). Nothing: the model does not take it. Absent: not known here."""
+        return {}
+
     @model_validator(mode="before")
     @classmethod
     def _name_registers(cls, data: Any) -> Any:

@@ -6,6 +6,7 @@ Times in seconds unless the key says `_ms`; positions in the servo's unit, speed
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -126,6 +127,7 @@ class BusOptions(Data):
     timeout_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
     """Greatest deadline of a turn beyond its wire time; 100 ms if omitted."""
     faults: FaultOptions | None = None
+    servos: Mapping[Name, ServoOptions] = {}
 
     @model_validator(mode="after")
     def _faults_only_simulated(self) -> Self:

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from servobus.protocols.base import GoalKind
-from servobus.protocols.model import Data, Pair, ServoModel
+from servobus.protocols.model import Data, Pair, Register, ServoModel
 
 
 class Sentinel(Data):
@@ -57,6 +57,17 @@ class SmsModel(ServoModel):
     @property
     def kinds(self) -> tuple[GoalKind, ...]:
         return ("position", "velocity") if self.wheel else ("position",)
+
+    @property
+    def reach(self) -> dict[str, tuple[float, float]]:
+        position, _, speed = self.goal
+        names = {"position": position, "speed": speed, "acceleration": "acceleration", "torque_limit": "torque_limit"}
+        return {part: self._reach_of(self.registers.get(name)) for part, name in names.items()}
+
+    @staticmethod
+    def _reach_of(register: Register | None) -> tuple[float, float]:
+        least, greatest = register.span if register else (0, 0)
+        return (least * register.scale, greatest * register.scale) if register else (0.0, 0.0)
 
     @model_validator(mode="after")
     def _parts_exist(self) -> Self:

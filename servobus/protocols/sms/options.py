@@ -20,8 +20,9 @@ class SmsBus(BusOptions):
     protocol: Literal["sms"]
     sync_max_bytes: Annotated[int, Field(ge=16, le=259)] = 128
     """Greatest SYNC WRITE frame; the length byte allows 259 bytes, the servos' buffers are not documented."""
-    status_return: Literal["all", "read_only", "none"] = "all"
+    status_return: Literal["all", "read_only"] = "all"
     """Which instructions are answered (response level of the memory table): with read_only no write is."""
     on_partial: Literal["abort", "go"] = "abort"
     """When a REG WRITE stays unacknowledged: withhold ACTION, or send it for those that are armed."""
-    servos: Annotated[dict[Name, SmsServo], Field(min_length=1)]
+    servos: dict[Name, SmsServo] = {}
+    """Empty: a line to scan."""

@@ -1,0 +1,112 @@
+"""When the line may be spoken on. Pure: told what was said and heard, and when.
+
+After opening, after a missing answer and after anything unexpected the line is listened out until it was quiet for a
+while. What was handed to the UART cannot be recalled, so at most one frame may wait in it behind the one that is
+leaving.
+"""
+
+from __future__ import annotations
+
+from servobus.protocols.base import LineTraits
+
+QUIET = 0.002
+"""Seconds without a byte after which the line counts as quiet."""
+START_QUIET = 0.020
+"""After opening: a servo may still be answering somebody else, or hold half a frame."""
+BABBLE = 0.250
+"""Seconds of uninterrupted talk after which it is no late reply any more."""
+
+
+class EchoFilter:
+    """Takes our own bytes out of what is heard, on a line that is known to echo."""
+
+    __slots__ = ("_expected", "collisions")
+
+    def __init__(self) -> None:
+        self._expected = b""
+        self.collisions = 0
+        """Times something else was heard where our own bytes were due."""
+
+    def sent(self, frame: bytes) -> None:
+        self._expected += frame
+
+    def strip(self, data: bytes) -> bytes:
+        """What is left of `data` when our own bytes are taken out."""
+        if not self._expected:
+            return data
+        length = min(len(data), len(self._expected))
+        if data[:length] != self._expected[:length]:
+            self.collisions += 1
+            self._expected = b""
+            return data
+        self._expected = self._expected[length:]
+        return data[length:]
+
+    def reset(self) -> None:
+        self._expected = b""
+
+
+class Line:
+    """The state of one half-duplex line as its master knows it."""
+
+    __slots__ = ("_last_start", "_listening_since", "_quiet_at", "babbling", "drains", "echo", "sent_by", "traits")
+
+    def __init__(self, traits: LineTraits) -> None:
+        self.traits = traits
+        self.echo: EchoFilter | None = None
+        self.babbling = False
+        """It has talked without a pause for too long; only an e-stop is still said."""
+        self.drains = 0
+        self.sent_by = 0.0
+        """When everything handed to the UART has left it."""
+        self._last_start = 0.0
+        """When the last frame began to leave: until then no other is handed over."""
+        self._quiet_at = 0.0
+        self._listening_since: float | None = None
+
+    def opened(self, now: float) -> None:
+        self.sent_by = self._last_start = now
+        self._listening_since = None
+        self.babbling = False
+        self.listen_out(now, START_QUIET)
+
+    def listen_out(self, now: float, quiet: float = QUIET) -> None:
+        """Something was heard or missed that was not expected: wait for silence from here."""
+        if self._listening_since is None:
+            self._listening_since = now
+            self.drains += 1
+        self._quiet_at = now + quiet
+
+    @property
+    def listening_out(self) -> bool:
+        return self._listening_since is not None
+
+    def ready_at(self, now: float, *, urgent: bool) -> float:
+        """When the next frame may be handed over; not after `now`: at once."""
+        if self._listening_since is not None and now < self._quiet_at:
+            self.babbling = self.babbling or now - self._listening_since > BABBLE
+            if not (self.babbling and urgent):  # an e-stop is not held back by a node that never stops talking
+                return self._quiet_at
+        return max(self._quiet_at if self._listening_since is None else now, self._last_start)
+
+    def quiet(self) -> None:
+        """It was listened out, and is about to be spoken on."""
+        self._listening_since = None
+        self.babbling = False
+        if self.echo is not None:
+            self.echo.reset()
+
+    def speak(self, frame: bytes, now: float, quiet_after: float) -> float:
+        """A frame is handed over; when its first byte leaves."""
+        start = max(now, self.sent_by) + self.traits.gap
+        self._last_start = start
+        self.sent_by = start + len(frame) * self.traits.byte_time
+        self._quiet_at = self.sent_by + quiet_after if quiet_after else 0.0
+        if self.echo is not None:
+            self.echo.sent(frame)
+        return start
+
+    def answered(self, now: float, quiet_after: float) -> None:
+        """The silence that must follow an answer."""
+        if quiet_after:
+            self._quiet_at = now + quiet_after

@@ -1,0 +1,223 @@
+"""Everything that moves on one bus: goals, enable, disable, e-stop, and what is left behind at the end.
+
+Refusals come first and cost no byte. What an e-stop or a restart has ended is never sent again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from servobus.bus.coalescer import Ticket
+from servobus.bus.health import Condition, Node
+from servobus.bus.limits import check_goal
+from servobus.bus.queue import Job
+from servobus.bus.record import ServoRecord
+from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError
+from servobus.protocols.base import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
+
+if TYPE_CHECKING:
+    from servobus.bus.service import BusService
+
+LEAST_TTL = 0.2
+"""Seconds a goal may wait for its first byte, unless two learned turns take longer."""
+FRESH = 0.1
+"""Seconds for which a position is good enough to be held at once by an e-stop."""
+STOP_PATIENCE = 2.0
+SETTLE_PERIOD = 0.02
+_batches = itertools.count(1)
+
+
+class Motion:
+    """Goals and stops of one bus."""
+
+    def __init__(self, bus: BusService) -> None:
+        self._bus = bus
+        self.latched = False
+        """The e-stop holds: motion and enable are refused until it is cleared."""
+
+    def check(self, goals: Mapping[str, Goal]) -> dict[str, Goal]:
+        """The goals to send, clamped where a servo says so. Raises what refuses any of them; nothing is sent."""
+        self.refuse()
+        checked = {}
+        for servo, goal in goals.items():
+            record = self._bus.records[servo]
+            if not record.enabled:
+                raise NotEnabled("the servo is not enabled: enable it first", bus=self._bus.name, servo=servo)
+            try:
+                checked[servo] = check_goal(servo, goal, record.options, record.reference())
+                self._bus.driver.check_goal(ServoGoal(servo, checked[servo], record.reference()))
+            except ServobusError as error:
+                raise error.at(bus=self._bus.name) from None
+            if checked[servo] != goal:
+                self._bus.stats.counts["goals_clamped"] += 1
+                self._bus.event("goal_clamped", bus=self._bus.name, servo=servo, asked=goal.value, applied=checked[servo].value)
+        return checked
+
+    def put(self, goals: Mapping[str, Goal], *, together: bool, confirm: bool) -> dict[str, asyncio.Future[Outcome]]:
+        """Checked goals on their way; each future ends with its outcome or its error."""
+        bus = self._bus
+        batch = next(_batches) if together else None
+        futures = {}
+        for servo, goal in goals.items():
+            future: asyncio.Future[Outcome] = bus.loop.create_future()
+            ticket = self._ticket(bus.records[servo], goal, future)
+            ticket.batch, ticket.confirm = batch, confirm
+            future.add_done_callback(partial(self._forget, ticket))
+            bus.stats.counts["goals"] += 1
+            bus.scheduler.coalescer.put(ticket)
+            futures[servo] = future
+        if bus.master.up:
+            bus.master.goals_waiting()
+        else:
+            bus.scheduler.coalescer.drop(lambda servo: LinkDown("the line is down: nothing was sent", bus=bus.name, servo=servo))
+        return futures
+
+    def _ticket(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome]) -> Ticket:
+        now = self._bus.clock()
+        patience = 2 * (record.node.deadline + self._bus.line.traits.latency)
+        ttl = goal.deadline or record.options.ttl or max(LEAST_TTL, patience)
+        position = record.position(now, FRESH)
+        start = record.reference() if position is None else position
+        return Ticket(ServoGoal(record.name, goal, start), record.node.id, now + ttl, partial(self._settle, record, goal, future))
+
+    def _settle(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome], result: Outcome | Exception) -> None:
+        """A ticket has ended."""
+        counts = self._bus.stats.counts
+        if isinstance(result, Outcome):
+            if result is not Outcome.SUPERSEDED and goal.kind == "position":
+                record.setpoint = goal.value
+            counts[f"goals_{result}"] += 1
+            if not future.done():
+                future.set_result(result)
+            return
+        counts["goals_failed"] += 1
+        if not future.done():
+            error = copy(result)  # one error may end the tickets of several servos
+            future.set_exception(error.at(bus=self._bus.name, servo=record.name) if isinstance(error, ServobusError) else error)
+
+    def _forget(self, ticket: Ticket, future: asyncio.Future[Outcome]) -> None:
+        if future.cancelled():
+            self._bus.scheduler.coalescer.discard(ticket)
+
+    async def enable(self, servo: str) -> None:
+        self.refuse()
+        record = self._bus.records[servo]
+        if record.identity is None:
+            await self._bus.identify(servo)
+        self._set_enabled(record, False)
+        present = await self._bus.at(servo, self._bus.perform(self._bus.driver.enable(servo), record.node.id, motion=True))
+        if self.latched:
+            raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
+        record.setpoint = present
+        self._set_enabled(record, True)
+
+    async def disable(self, servo: str) -> None:
+        record = self._bus.records[servo]
+        self._bus.scheduler.coalescer.drop(self._disabled, {record.node.id})
+        self._set_enabled(record, False)
+        report = await self._bus.at(servo, self._bus.perform(self._bus.driver.disable(servo), record.node.id, urgent=True))
+        if not report.confirmed:
+            raise DeviceError(f"torque off was written and not confirmed: {report.detail}", bus=self._bus.name, servo=servo)
+
+    async def stop(self) -> dict[str, StopReport]:
+        """E-stop for this bus: everything that moves is dropped, every servo stops as its `on_estop` says (park: holds first)."""
+        self.latched = True
+        return await self._stop(lambda record: record.options.on_estop, list(self._bus.records.values()))
+
+    async def limp(self, servos: Sequence[str]) -> dict[str, StopReport]:
+        """Torque off for these, ahead of everything."""
+        return await self._stop(lambda _: "limp", [self._bus.records[servo] for servo in servos])
+
+    async def _stop(self, kind_of: Callable[[ServoRecord], str], records: Sequence[ServoRecord]) -> dict[str, StopReport]:
+        now = self._bus.clock()
+        targets = [
+            StopTarget(
+                record.name,
+                "limp" if kind_of(record) == "limp" else "hold",
+                enabled=record.enabled,
+                position=record.position(now, FRESH),
+                reachable=record.node.condition is not Condition.OFFLINE,
+            )
+            for record in records
+        ]
+        if not targets:
+            return {}
+        future: asyncio.Future[dict[str, StopReport]] = self._bus.loop.create_future()
+        job = Job(future, now + STOP_PATIENCE, plan=self._bus.driver.stop(targets), node=records[0].node.id)
+        try:
+            self._bus.master.submit_estop(job)
+            reports = await future
+        except ServobusError as error:
+            job.fail(error)
+            reports = {target.servo: StopReport(target.kind, False, False, str(error)) for target in targets}
+        for record, target in zip(records, targets, strict=True):
+            record.setpoint = None
+            if target.kind == "limp":
+                self._set_enabled(record, False)
+        return reports
+
+    async def settle(self, servo: str, *, tolerance: float | None, timeout: float) -> State:
+        """Until it stands at its setpoint. Raises DeviceError with where it stands."""
+        bus, record = self._bus, self._bus.records[servo]
+        near = bus.tolerance(servo) if tolerance is None else tolerance
+        end = bus.clock() + timeout
+        while True:
+            state = await bus.read(servo, SETTLE_PERIOD)
+            there = record.setpoint is None or (state.position is not None and abs(state.position - record.setpoint) <= near)
+            if there and not state.moving:
+                return state
+            if bus.clock() >= end:
+                raise DeviceError(
+                    f"it did not settle within {timeout:g} s: it stands at {state.position}, its goal is {record.setpoint}",
+                    bus=bus.name,
+                    servo=servo,
+                )
+            await asyncio.sleep(SETTLE_PERIOD)
+
+    async def park(self, servo: str) -> StopReport:
+        """To the park pose within `park_timeout`, then limp, even if it does not get there. Not refused by the e-stop it serves."""
+        options = self._bus.records[servo].options
+        detail = ""
+        try:
+            assert options.park_pose is not None
+            goal = Goal("position", options.park_pose)
+            await self.put({servo: goal}, together=False, confirm=False)[servo]
+            await self.settle(servo, tolerance=None, timeout=options.park_timeout)
+        except ServobusError as error:
+            detail = f"not at its park pose: {error.message}"
+        report = (await self.limp([servo]))[servo]
+        return replace(report, action="park", confirmed=report.confirmed and not detail, detail=detail or report.detail)
+
+    def refuse(self) -> None:
+        if self.latched:
+            raise EStopped("the e-stop is latched: `clear` releases it", bus=self._bus.name)
+        if self._bus.scheduler.session is not None:
+            raise LeaseHeld("a scan or commissioning session has this bus: motion waits until it ends", bus=self._bus.name)
+
+    def disable_restarted(self, node: Node) -> list[ServoRecord]:
+        """The node has lost what enable() wrote: its servos that were enabled, now disabled."""
+        restarted = [record for record in self._bus.on(node) if record.enabled]
+        for record in restarted:
+            record.setpoint = None
+            self._set_enabled(record, False)
+        self._bus.scheduler.coalescer.drop(self._disabled, {node.id})
+        return restarted
+
+    async def leave(self) -> dict[str, StopReport]:
+        """What each enabled servo's `on_exit` says, hold and limp; park is the rig's."""
+        return await self._stop(
+            lambda record: record.options.on_exit, [record for record in self._bus.records.values() if record.enabled]
+        )
+
+    def _set_enabled(self, record: ServoRecord, enabled: bool) -> None:
+        record.enabled = enabled
+        record.node.enabled = any(other.enabled for other in self._bus.on(record.node))
+
+    def _disabled(self, servo: str) -> ServobusError:
+        return NotEnabled("the servo was disabled before this goal could leave", bus=self._bus.name, servo=servo)

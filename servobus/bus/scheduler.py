@@ -1,0 +1,250 @@
+"""Decides the next turn: e-stop, goals, requests, polls, probes. Pure: `next_turn(now)` returns a decision, the
+master acts on it.
+
+Two rules hold. A higher class goes first; and after each turn of a class, one turn of a lower class follows if any
+waits, so that nothing starves: a flood of goals still leaves every second turn to requests, every fourth to polls,
+every eighth to probes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from servobus.bus.coalescer import Coalescer, Group, Ticket
+from servobus.bus.health import Condition, Health, Node
+from servobus.bus.queue import Callback, Job, RequestQueue, overloaded
+from servobus.errors import ReplyTimeout, ServobusError
+from servobus.protocols.base import Driver, GoalTurn, Outcome, Plan, Poll
+
+QUEUE_LIMIT = 1024
+"""Jobs that may wait on one bus."""
+POLL_PATIENCE = 1.0
+"""Seconds after which a poll that could not be sent is not wanted any more."""
+
+
+@dataclass(slots=True)
+class PollTimer:
+    """A poll on a fixed grid: `due` moves by whole periods, so a late poll does not shift the next one."""
+
+    poll: Poll
+    due: float
+    missed: int = 0
+
+    def advance(self, now: float) -> None:
+        period = 1.0 / self.poll.hz
+        self.due += period
+        if self.due <= now:
+            behind = int((now - self.due) / period) + 1
+            self.missed += behind
+            self.due += behind * period
+
+
+class Scheduler:
+    """The five classes of one bus and the order between them."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        health: Health,
+        *,
+        on_update: Callable[[Any], None],
+        on_restart: Callable[[Node], None],
+        limit: int = QUEUE_LIMIT,
+    ) -> None:
+        self.driver = driver
+        self.health = health
+        self.coalescer = Coalescer()
+        self.requests = RequestQueue(limit)
+        self.estop: deque[Job] = deque()
+        self.session: object = None
+        """While set, polls, probes and goals rest and only this session's requests are served."""
+        self.split_groups = 0
+        self._limit = limit
+        self._on_update = on_update
+        self._on_restart = on_restart
+        self._goal_jobs: deque[tuple[Job, list[Ticket]]] = deque()
+        self._polls: list[PollTimer] = []
+        self._poll_due = math.inf
+        self._parked: list[Job] = []
+        self._lanes = (self._next_goal, self._next_request, self._next_poll, self._next_probe)
+        self._owed = [False] * len(self._lanes)
+
+    # What waits
+
+    def submit(self, job: Job, now: float) -> None:
+        """Raises Overloaded. A job for an offline node waits aside for as long as an answer would have taken, and fails then,
+        unless the node comes back: a dead servo costs the line nothing."""
+        node = self.health.node(job.node)
+        if node.condition is Condition.OFFLINE and not job.urgent:
+            if len(self._parked) >= self._limit:
+                raise overloaded(len(self._parked))
+            job.expires = min(job.expires, now + node.deadline)
+            self._parked.append(job)
+        else:
+            self.requests.put(job)
+
+    def retry(self, job: Job) -> None:
+        """It failed and may be said again: it stays the first of its node, and the other nodes have their turns before it."""
+        self.requests.put_back(job)
+
+    def set_polls(self, polls: Sequence[Poll], now: float) -> None:
+        """Polls of one rate are spread over their period."""
+        self._polls = [PollTimer(poll, now + index / len(polls) / poll.hz) for index, poll in enumerate(polls)]
+        self._poll_due = min((timer.due for timer in self._polls), default=math.inf)
+
+    @property
+    def missed_polls(self) -> int:
+        """Grid points that passed without their poll."""
+        return sum(timer.missed for timer in self._polls)
+
+    def waiting(self) -> int:
+        """Everything that waits, for people."""
+        return len(self.requests) + len(self.coalescer) + len(self._parked) + len(self.estop) + len(self._goal_jobs)
+
+    # The decision
+
+    def next_turn(self, now: float) -> Job | None:
+        """What shall be on the wire next; None: nothing yet, see `wake`."""
+        if self.estop:
+            return self.estop.popleft()
+        if self.session is not None:
+            return self.requests.take(now, self.session)
+        return self._pick(0, now)
+
+    def _pick(self, lane: int, now: float) -> Job | None:
+        if lane == len(self._lanes):
+            return None
+        if not self._owed[lane]:
+            job = self._lanes[lane](now)
+            if job is not None:
+                self._owed[lane] = True
+                return job
+        lower = self._pick(lane + 1, now)
+        if lower is not None:
+            self._owed[lane] = False
+            return lower
+        return self._lanes[lane](now) if self._owed[lane] else None
+
+    def wake(self) -> float | None:
+        """The next moment at which something becomes due or too old, if nothing else happens."""
+        times = [self.requests.next_expiry(), self.coalescer.next_expiry()]
+        times.extend(job.expires for job in self._parked)
+        if self.session is None:
+            times.append(self.health.next_probe())
+            times.append(self._poll_due if self._polls else None)
+        return min((time for time in times if time is not None), default=None)
+
+    def expire(self, now: float) -> None:
+        """End what is too old. Called when nothing can be sent, or nothing is due."""
+        self.requests.expire(now)
+        self.coalescer.expire(now)
+        late = [job for job in self._parked if job.expires <= now or job.sink.done()]
+        if late:
+            self._parked = [job for job in self._parked if job not in late]
+            for job in late:
+                job.fail(ReplyTimeout("the servo is offline: it is probed, and served again when it answers"))
+
+    def node_changed(self, node: Node) -> None:
+        """Jobs set aside for a node that came back go on; those in the queue of one that went offline are set aside."""
+        if node.condition is Condition.OFFLINE:
+            self._parked.extend(self.requests.remove(lambda job: job.node == node.id and not job.urgent))
+            return
+        back = [job for job in self._parked if job.node == node.id]
+        if back:
+            self._parked = [job for job in self._parked if job.node != node.id]
+            for job in reversed(back):
+                self.requests.put_back(job)
+
+    def drop(self, error: Callable[[str], ServobusError], *, motion_only: bool) -> None:
+        """End everything that waits, or only what would move something."""
+        self.coalescer.drop(error)
+        goal_jobs, self._goal_jobs = self._goal_jobs, deque()
+        unwanted = [*(job for job, _ in goal_jobs), *self.requests.remove(lambda job: job.motion or not motion_only)]
+        if not motion_only:
+            unwanted.extend((*self._parked, *self.estop))
+            self._parked.clear()
+            self.estop.clear()
+        for job in unwanted:
+            job.fail(error(""))
+
+    # The lanes
+
+    def _next_goal(self, now: float) -> Job | None:
+        while self._goal_jobs or self._plan_goals(now):
+            job, tickets = self._goal_jobs.popleft()
+            ready = self.health.reachable()
+            if all(ticket.node in ready for ticket in tickets):
+                return job
+            # A frame of a split group waited, and meanwhile a servo of it missed an answer: it may have restarted.
+            assert job.plan is not None
+            job.plan.close()
+            for ticket in tickets:
+                self.coalescer.put_back(ticket)
+        return None
+
+    def _plan_goals(self, now: float) -> bool:
+        """Make jobs of the next group; False: none is ready."""
+        while len(self.coalescer):
+            group = self.coalescer.take(now, self.health.reachable())
+            if group is None:
+                return False
+            try:
+                turns = self.driver.plan(
+                    [ticket.goal for ticket in group.tickets], together=group.together, confirm=group.confirm
+                )
+            except ServobusError as error:
+                for ticket in group.tickets:
+                    ticket.done(error)
+                continue
+            self.split_groups += len(turns) > 1
+            self._goal_jobs.extend(self._goal_job(turn, group) for turn in turns)
+            return True
+        return False
+
+    @staticmethod
+    def _goal_job(turn: GoalTurn, group: Group) -> tuple[Job, list[Ticket]]:
+        tickets = [ticket for ticket in group.tickets if ticket.servo in turn.servos]
+        expires = max(ticket.expires for ticket in tickets)
+        sink = Callback(lambda result: _settle(tickets, result))
+        return Job(sink, expires, plan=turn.plan, node=tickets[0].node, motion=True), tickets
+
+    def _next_request(self, now: float) -> Job | None:
+        return self.requests.take(now)
+
+    def _next_poll(self, now: float) -> Job | None:
+        while self._poll_due <= now:
+            timer = min(self._polls, key=lambda timer: timer.due)
+            timer.advance(now)
+            self._poll_due = min(timer.due for timer in self._polls)
+            request = timer.poll.request(self.health.reachable())
+            if request is not None:
+                return Job(Callback(self._on_update), now + POLL_PATIENCE, request=request, tries=1)
+        return None
+
+    def _next_probe(self, now: float) -> Job | None:
+        node = self.health.due_probe(now)
+        if node is None:
+            return None
+        return Job(Callback(_ignore), now + POLL_PATIENCE, plan=self.recovery(node), node=node.id, recovery=True)
+
+    def recovery(self, node: Node) -> Plan[bool]:
+        """The fence, and whether the servo still is as we left it. What makes a doubtful node believed again."""
+        kept = yield from self.driver.recover(node.id, list(node.outstanding), node.enabled)
+        if not kept:
+            self._on_restart(node)
+        self.health.recovered(node)
+        return kept
+
+
+def _settle(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | Exception) -> None:
+    """One result or one error for all of a turn's tickets."""
+    for ticket in tickets:
+        ticket.done(result[ticket.servo] if isinstance(result, dict) else result)
+
+
+def _ignore(_: object) -> None:
+    """A probe's outcome stands in the node's health."""

@@ -1,0 +1,243 @@
+"""The verbs of one bus: checks, records and the plans of its driver, on top of the engine.
+
+Refusals happen here, before anything is queued: limits, enable, e-stop, exclusive sessions. Nothing is written at
+start, a restarted servo is disabled and its goal is not sent again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+from servobus.bus.health import Condition, Health, Node
+from servobus.bus.line import EchoFilter, Line
+from servobus.bus.master import BusMaster
+from servobus.bus.motion import Motion
+from servobus.bus.queue import Callback, Job
+from servobus.bus.record import ServoRecord
+from servobus.bus.runner import Runner
+from servobus.bus.scheduler import Scheduler
+from servobus.bus.stats import BusStats
+from servobus.errors import LeaseHeld, LinkDown, NotSupported, ReplyTimeout, ServobusError
+from servobus.protocols.base import (
+    Codec,
+    Driver,
+    Identity,
+    LineTraits,
+    Plan,
+    Request,
+    State,
+    Update,
+)
+from servobus.protocols.options import BusOptions
+from servobus.timerfd import clock_of
+
+R = TypeVar("R")
+
+PATIENCE = 2.0
+"""Seconds a request may wait for its turn."""
+TOLERANCE_STEPS = 10
+DOWN_PAUSE = 0.02
+"""A caller that asks again and again while the line is down is answered this slowly, so that it does not burn the core."""
+
+Event = Callable[..., None]
+
+
+class BusService:
+    """One bus. `event(name, **fields)` is told what a person or a log should know."""
+
+    def __init__(self, name: str, options: BusOptions, driver: Driver, codec: Codec, traits: LineTraits, event: Event) -> None:
+        self.name = name
+        self.options = options
+        self.driver = driver
+        self.event = event
+        self.records: dict[str, ServoRecord] = {}
+        self.loop = asyncio.get_running_loop()
+        self.clock = clock_of(self.loop)
+        greatest = {} if options.timeout_ms is None else {"greatest_deadline": options.timeout_ms / 1000}
+        self.health = Health(set(driver.nodes.values()), changed=self._changed, **greatest)
+        self.stats = BusStats(self.clock())
+        self.scheduler = Scheduler(driver, self.health, on_update=self._updated, on_restart=self._restarted)
+        self.line = Line(traits)
+        if options.echo == "on":
+            self.line.echo = EchoFilter()
+        self.master = BusMaster(name, codec, Runner(name, self.scheduler, self.health, self.stats), self.line)
+        servos: Mapping[str, Any] = getattr(options, "servos")  # noqa: B009 - each protocol narrows it to its own class
+        for servo, entry in servos.items():
+            self.records[servo] = ServoRecord(servo, entry, self.health.node(driver.nodes[servo]))
+        self.motion = Motion(self)
+
+    # Start and end
+
+    async def start(self) -> None:
+        """After the line was opened: quiet, identify, read; then poll. Writes nothing. A missing servo is an event, no error."""
+        if self.options.echo == "auto":
+            await self._probe_echo()
+        await asyncio.gather(*(self._introduce(record) for record in self.records.values()))
+        if self.master.up:
+            self.scheduler.set_polls(self.driver.polls(self.options.poll.rates()), self.clock())
+            self.master.goals_waiting()
+
+    async def _probe_echo(self) -> None:
+        """A question nobody answers: what is heard is our own voice."""
+        before = self.stats.counts["echoes"]
+        try:
+            await self.ask(self.driver.unused(), tries=1)
+        except ReplyTimeout:
+            pass
+        except LinkDown:
+            return
+        if self.stats.counts["echoes"] > before:
+            self.line.echo = EchoFilter()
+        self.event("echo_probed", bus=self.name, echo="on" if self.line.echo else "off")
+
+    async def _introduce(self, record: ServoRecord) -> None:
+        try:
+            await self.identify(record.name)
+            await self.read(record.name)
+        except ServobusError as error:
+            self.event("servo_missing", bus=self.name, servo=record.name, id=record.node.id, reason=error.message)
+
+    # Requests and plans
+
+    async def ask(self, request: Request[R], *, urgent: bool = False, session: object = None, tries: int = 3) -> R:
+        """One request's value. Raises ReplyTimeout, DeviceError, LinkDown, Overloaded."""
+        future: asyncio.Future[R] = self.loop.create_future()
+        job = Job(future, self.clock() + PATIENCE, request=request, urgent=urgent, session=session, tries=tries)
+        return await self._await(job, future)
+
+    async def perform(self, plan: Plan[R], node: int, *, motion: bool = False, urgent: bool = False, session: object = None) -> R:
+        """A plan's result; nothing but an e-stop comes between its frames."""
+        future: asyncio.Future[R] = self.loop.create_future()
+        job = Job(future, self.clock() + PATIENCE, plan=plan, node=node, motion=motion, urgent=urgent, session=session)
+        return await self._await(job, future)
+
+    async def _await(self, job: Job, future: asyncio.Future[R]) -> R:
+        try:
+            self.master.submit(job)
+        except ServobusError as error:
+            job.fail(error)
+            await asyncio.sleep(DOWN_PAUSE)
+        return await future
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """For an exclusive session."""
+        if baudrate != self.line.traits.baudrate:
+            self.master.set_baudrate(baudrate)
+
+    # Reading
+
+    async def read(self, servo: str, max_age: float | None = None) -> State:
+        record = self.records[servo]
+        if max_age is None or record.updated_at is None or self.clock() - record.updated_at > max_age:
+            self._updated(await self.at(servo, self.ask(self.driver.read_state(servo))))
+        return self.state(servo)
+
+    def state(self, servo: str) -> State:
+        record = self.records[servo]
+        return record.state(self.clock(), self.driver.fault_names(servo, record.node.status))
+
+    def tolerance(self, servo: str) -> float:
+        """What counts as arrived, in the servo's unit, when nobody says."""
+        return TOLERANCE_STEPS * self.driver.step(servo)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Counters, latencies, and the condition of each node, for people and machines."""
+        counts = self.stats.counts
+        counts["drains"] = self.line.drains
+        counts["polls_missed"] = self.scheduler.missed_polls
+        counts["goal_groups_split"] = self.scheduler.split_groups
+        nodes = {
+            str(node.id): {"health": node.condition.value, "misses": node.misses, "deadline_ms": round(1e3 * node.deadline, 3)}
+            for node in self.health.nodes.values()
+            if node.configured
+        }
+        return {"up": self.master.up, "waiting": self.scheduler.waiting(), **self.stats.snapshot(self.clock()), "nodes": nodes}
+
+    async def read_register(self, servo: str, register: str, *, raw: bool = False) -> Any:
+        return await self.at(servo, self.ask(self.driver.read_register(servo, register, raw=raw)))
+
+    async def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
+        if persist and self.records[servo].enabled:
+            raise NotSupported("EEPROM is written to disabled servos only: disable it first", bus=self.name, servo=servo)
+        plan = self.driver.write_register(servo, register, value, raw=raw, persist=persist)
+        return await self.at(servo, self.perform(plan, self.driver.nodes[servo]))
+
+    async def ping(self, servo: str) -> int | None:
+        return await self.at(servo, self.ask(self.driver.ping(self.driver.nodes[servo]), urgent=True))
+
+    async def identify(self, servo: str) -> Identity:
+        identity = await self.at(servo, self.perform(self.driver.identify(servo), self.driver.nodes[servo], urgent=True))
+        self._introduced(self.records[servo], identity)
+        return identity
+
+    def _introduced(self, record: ServoRecord, identity: Identity) -> None:
+        if record.identity != identity:
+            for note in identity.notes:
+                self.event("servo_note", bus=self.name, servo=record.name, note=note)
+        record.identity = identity
+
+    # Sessions
+
+    @asynccontextmanager
+    async def exclusive(self) -> AsyncIterator[object]:
+        """Polls, probes and goals rest, motion is refused, other requests wait. Raises LeaseHeld when one is open already."""
+        self.motion.refuse()
+        moving = [record.name for record in self.records.values() if record.enabled]
+        if moving:
+            raise LeaseHeld(f"{', '.join(moving)} {'is' if len(moving) == 1 else 'are'} enabled: disable first", bus=self.name)
+        self.scheduler.session = session = object()
+        try:
+            yield session
+        finally:
+            self.scheduler.session = None
+            if self.master.up:
+                self.master.goals_waiting()
+
+    # What the engine tells
+
+    def _updated(self, result: dict[str, Update] | Exception) -> None:
+        """A poll or a read has brought something; a failed poll stands in the node's health."""
+        if isinstance(result, dict):
+            now = self.clock()
+            for servo, fields in result.items():
+                self.records[servo].update(fields, now)
+
+    def _restarted(self, node: Node) -> None:
+        self.stats.counts["restarts"] += 1
+        for record in self.motion.disable_restarted(node):
+            self.event("servo_restarted", bus=self.name, servo=record.name, id=node.id)
+
+    def _changed(self, node: Node, before: Condition) -> None:
+        self.scheduler.node_changed(node)
+        if not node.configured:
+            return
+        names = [record.name for record in self.on(node)]
+        if Condition.OFFLINE in (node.condition, before):
+            self.event(f"servo_{node.condition}", bus=self.name, servo=",".join(names), id=node.id)
+        for record in self.on(node):
+            if node.condition is Condition.ONLINE and record.identity is None:
+                self._introduce_later(record)
+
+    def _introduce_later(self, record: ServoRecord) -> None:
+        """A servo that was missing at the start has appeared."""
+
+        def introduced(result: Identity | Exception) -> None:
+            if isinstance(result, Identity):
+                self._introduced(record, result)
+
+        job = Job(Callback(introduced), self.clock() + PATIENCE, plan=self.driver.identify(record.name), node=record.node.id)
+        self.scheduler.requests.put(job)
+
+    def on(self, node: Node) -> list[ServoRecord]:
+        """The servos of a node."""
+        return [record for record in self.records.values() if record.node is node]
+
+    async def at(self, servo: str, awaitable: Awaitable[R]) -> R:
+        """Give an error from below its place."""
+        try:
+            return await awaitable
+        except ServobusError as error:
+            raise error.at(bus=self.name, servo=servo) from None

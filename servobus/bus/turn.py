@@ -1,0 +1,148 @@
+"""What is on the wire: a turn (one request and what was heard since), and a run (the job it belongs to). Pure.
+
+A turn judges the window it listens in. Valid replies that are no answer are strays, a frame identical to the request
+is an echo and never an answer by itself, and when the last answer is followed by bytes that are no frame the whole
+window is rejected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+from servobus.bus.queue import Job
+from servobus.errors import ServobusError
+from servobus.protocols.base import Codec, Plan, Reply, Request
+
+
+class Turn:
+    """One request under way."""
+
+    __slots__ = ("deadline", "echoes", "looked", "replies", "request", "sent_at", "sent_by")
+
+    def __init__(self, request: Request[Any], *, sent_at: float, sent_by: float, deadline: float) -> None:
+        self.request = request
+        self.sent_at = sent_at
+        """When its first byte left."""
+        self.sent_by = sent_by
+        """When its last byte has left."""
+        self.deadline = deadline
+        self.replies: list[Any] = []
+        self.echoes = 0
+        self.looked = False
+        """The line was looked at once more after the deadline."""
+
+    def offer(self, reply: Reply) -> bool:
+        """Take a valid frame; False: it is a stray."""
+        if reply.frame == self.request.frame:
+            self.echoes += 1
+            return True
+        if len(self.replies) >= self.request.replies or not self.request.answers(reply):
+            return False
+        if self.replies and any(earlier.node == reply.node for earlier in self.replies):
+            return False
+        self.replies.append(reply)
+        return True
+
+    def complete(self) -> bool:
+        return len(self.replies) == self.request.replies
+
+    def missing(self) -> list[int]:
+        """Nodes whose answer has not come."""
+        heard = {reply.node for reply in self.replies}
+        return [node for node in self.request.nodes if node not in heard]
+
+
+class Finished(Exception):
+    """The job's plan returned."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__()
+        self.value = value
+
+
+class Run:
+    """A job that has begun: which request is next. A recovery can be put before any request; its end leads back to it."""
+
+    __slots__ = ("_detour", "_resume", "attempts", "job", "recovering", "request")
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.attempts = job.attempts
+        """Times the present request was said in vain."""
+        self.recovering = job.recovery
+        self._detour: Plan[bool] | None = None
+        self._resume: tuple[Request[Any], int] | None = None
+        self.request: Request[Any]
+
+    @property
+    def simple(self) -> bool:
+        """One request and nothing around it."""
+        return self.job.plan is None and self._detour is None
+
+    def begin(self) -> None:
+        """Find the first request. Raises Finished, or the plan's error."""
+        if self.job.request is not None:
+            self.request = self.job.request
+        else:
+            assert self.job.plan is not None
+            self.request = _step(self.job.plan, None)
+
+    def detour(self, recovery: Plan[bool]) -> None:
+        """Recover the node first, then say the present request."""
+        self._resume, self._detour, self.recovering = (self.request, self.attempts), recovery, True
+        self.attempts = 0
+        self.request = _step(recovery, None)
+
+    def succeed(self, value: Any) -> bool | None:
+        """The present request has its value. Returns whether the node kept its state, when a detour ended with this, else None.
+        Raises Finished when the job has its result, or the plan's own error."""
+        self.attempts = 0
+        if self._detour is not None:
+            try:
+                self.request = _step(self._detour, value)
+            except Finished as end:
+                self._leave_detour()
+                return bool(end.value)
+            return None
+        if self.job.plan is None:
+            raise Finished(value)
+        self.request = _step(self.job.plan, value)
+        return None
+
+    def fail(self, error: ServobusError) -> None:
+        """The present request is given up. Raises Finished or an error when that ends the job."""
+        self.attempts = 0
+        if self._detour is not None:
+            try:
+                self.request = self._detour.throw(error)
+                return
+            except ServobusError as raised:
+                self._leave_detour()
+                self.attempts = 0
+                error = raised
+        if self.job.plan is None:
+            raise error
+        try:
+            self.request = self.job.plan.throw(error)
+        except StopIteration as stop:
+            raise Finished(stop.value) from None
+
+    def _leave_detour(self) -> None:
+        assert self._resume is not None
+        (self.request, self.attempts), self._detour, self._resume, self.recovering = self._resume, None, None, self.job.recovery
+
+
+def _step(plan: Generator[Request[Any], Any, Any], value: Any) -> Request[Any]:
+    try:
+        return plan.send(value)
+    except StopIteration as stop:
+        raise Finished(stop.value) from None
+
+
+def judge(codec: Codec, turn: Turn, strays: list[Reply]) -> bool:
+    """Hear out what the codec holds. True: the turn has all its answers and the window ends with a whole frame."""
+    while (reply := codec.next_reply()) is not None:
+        if not turn.offer(reply):
+            strays.append(reply)
+    return turn.complete() and not codec.pending

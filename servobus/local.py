@@ -1,0 +1,289 @@
+"""LocalRig: the rig whose ports this process owns.
+
+Each bus has a keeper: it opens the port, introduces the servos, waits for the line to go down and opens it again, and
+none of it touches another bus. Nothing is written at start; at the end every servo that was enabled here is left as its
+`on_exit` says.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import anyio
+import structlog
+
+from servobus.bus.scan import scan
+from servobus.bus.service import BusService
+from servobus.config import Config, load_config
+from servobus.errors import EStopped, LinkDown, PartialFailure, ServobusError, UnknownName
+from servobus.links import open_link
+from servobus.links.base import Link
+from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
+from servobus.protocols.options import BusOptions
+from servobus.protocols.table import PROTOCOLS
+from servobus.rig import Found, Rig, Snapshot
+from servobus.sim.build import simulated_link
+
+R = TypeVar("R")
+
+RETRY = 0.1
+"""Seconds between two looks for a port that is not there."""
+EXIT_TIMEOUT = 1.0
+"""Seconds the exit policies may take, parking apart."""
+
+log = structlog.get_logger("servobus")
+
+
+class LocalRig(Rig):
+    """Made by `servobus.open`, and alive as long as that context."""
+
+    def __init__(self, config: Config, only: Collection[str] = ()) -> None:
+        self.config = config
+        self.buses: dict[str, BusService] = {}
+        self._links: dict[str, Link] = {}
+        self._names: dict[str, tuple[str, str]] = {}
+        self._tried: dict[str, asyncio.Event] = {}
+        self._down: dict[str, LinkDown] = {}
+        self._parking: set[asyncio.Task[None]] = set()
+        for name in only or config.buses:
+            self._add(name, config.buses[name])
+
+    def _add(self, name: str, options: BusOptions) -> None:
+        entry, models = PROTOCOLS[options.protocol], self.config.models[name]
+        link = simulated_link(options, models) if options.port.startswith("sim:") else open_link(options)
+        driver = entry.driver(options, models)
+        self._links[name] = link
+        self.buses[name] = BusService(name, options, driver, entry.codec(), link.traits, self._event)
+        self._tried[name] = asyncio.Event()
+        self._names.update({f"{name}/{servo}": (name, servo) for servo in driver.nodes})
+
+    @property
+    def names(self) -> Mapping[str, tuple[str, str]]:
+        return self._names
+
+    def bus_of(self, name: str) -> tuple[BusService, str]:
+        """The bus and the bare name of a servo, by full or unique bare name. Raises UnknownName."""
+        bus, servo = self._names[self.full_name(name)]
+        return self.buses[bus], servo
+
+    # Lines
+
+    async def keep(self, name: str) -> None:
+        """Open the line, and again whenever it is gone. Ends by being cancelled."""
+        bus, link = self.buses[name], self._links[name]
+        while True:
+            try:
+                await link.connect(bus.master)
+            except LinkDown as error:
+                if str(error) != str(self._down.get(name)):
+                    self._event("waiting_for_port", bus=name, port=link.address, reason=error.message)
+                self._down[name] = error
+                self._tried[name].set()
+                await anyio.sleep(RETRY)
+                continue
+            self._down.pop(name, None)
+            self._event("line_up", bus=name, port=link.address)
+            await bus.start()
+            self._tried[name].set()
+            await bus.master.wait_closed()
+            self._event("line_down", bus=name, port=link.address)
+
+    async def ready(self, *, degraded: bool) -> None:
+        """Until every line was tried. Raises the first LinkDown, unless `degraded`."""
+        for tried in self._tried.values():
+            await tried.wait()
+        if self._down and not degraded:
+            name, error = next(iter(self._down.items()))
+            raise error.at(bus=name)
+
+    async def leave(self) -> None:
+        """Exit policies, on all buses at once: park first where a servo says so."""
+        parked = [self._park(bus, servo) for bus, servo in self._enabled("on_exit", "park")]
+        await asyncio.gather(*parked, *self._parking)
+        with anyio.move_on_after(EXIT_TIMEOUT):
+            reports = await asyncio.gather(*(bus.motion.leave() for bus in self.buses.values()))
+            for bus, report in zip(self.buses, reports, strict=True):
+                for servo, entry in report.items():
+                    if not entry.confirmed:
+                        self._event("exit_unconfirmed", bus=bus, servo=servo, action=entry.action, detail=entry.detail)
+        for service in self.buses.values():
+            service.master.close()
+
+    # Motion
+
+    async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
+        parts: dict[BusService, dict[str, Goal]] = {}
+        for name, goal in goals.items():
+            bus, servo = self.bus_of(name)
+            parts.setdefault(bus, {})[servo] = goal
+        checked = {bus: bus.motion.check(part) for bus, part in parts.items()}
+        futures = {
+            f"{bus.name}/{servo}": future
+            for bus, part in checked.items()
+            for servo, future in bus.motion.put(part, together=together, confirm=confirm).items()
+        }
+        return await _outcomes(futures)
+
+    async def enable(self, *names: str) -> None:
+        await self._each(names, lambda bus, servo: bus.motion.enable(servo))
+
+    async def disable(self, *names: str) -> None:
+        await self._each(names, lambda bus, servo: bus.motion.disable(servo))
+
+    async def stop(self) -> dict[str, StopReport]:
+        self._event("estop")
+        parking = self._enabled("on_estop", "park")
+        reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
+        for bus, servo in parking:
+            task = asyncio.create_task(self._park(bus, servo))
+            self._parking.add(task)
+            task.add_done_callback(self._parking.discard)
+        return {f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()}
+
+    async def clear(self) -> None:
+        if self._parking:
+            raise EStopped("servos are still being parked: clear when they stand")
+        for bus in self.buses.values():
+            bus.motion.latched = False
+        self._event("estop_cleared")
+
+    @property
+    def stopped(self) -> bool:
+        return any(bus.motion.latched for bus in self.buses.values())
+
+    async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
+        full = self.full_names(names)
+        states = await asyncio.gather(*(self._settle(name, tolerance, timeout) for name in full))
+        return dict(zip(full, states, strict=True))
+
+    async def _settle(self, name: str, tolerance: float | None, timeout: float) -> State:
+        bus, servo = self.bus_of(name)
+        return await bus.motion.settle(servo, tolerance=tolerance, timeout=timeout)
+
+    async def _park(self, bus: BusService, servo: str) -> None:
+        """To the park pose, then limp; limp also when it does not get there in time."""
+        report = await bus.motion.park(servo)
+        if not report.confirmed:
+            self._event("park_unconfirmed", bus=bus.name, servo=servo, detail=report.detail)
+
+    def _enabled(self, policy: str, kind: str) -> list[tuple[BusService, str]]:
+        return [
+            (bus, record.name)
+            for bus in self.buses.values()
+            for record in bus.records.values()
+            if record.enabled and getattr(record.options, policy) == kind
+        ]
+
+    # Reading
+
+    async def read(self, name: str, *, max_age: float | None = None) -> State:
+        bus, servo = self.bus_of(name)
+        return await bus.read(servo, max_age)
+
+    def snapshot(self) -> Snapshot:
+        return {name: self.buses[bus].state(servo) for name, (bus, servo) in self._names.items()}
+
+    async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
+        if not 0 < hz <= 1000:
+            raise ValueError(f"watch: {hz} Hz is outside 0 to 1000")
+        clock = asyncio.get_running_loop().time
+        due = clock()
+        while True:
+            yield self.snapshot()
+            now = clock()
+            due += max(1.0, -(-(now - due) * hz // 1)) / hz  # the next point of the grid that has not passed
+            await asyncio.sleep(due - now)
+
+    async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:
+        bus, servo = self.bus_of(name)
+        return await bus.read_register(servo, register, raw=raw)
+
+    async def write_register(self, name: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
+        bus, servo = self.bus_of(name)
+        return await bus.write_register(servo, register, value, raw=raw, persist=persist)
+
+    async def ping(self, name: str) -> int | None:
+        bus, servo = self.bus_of(name)
+        return await bus.ping(servo)
+
+    async def identify(self, name: str) -> Identity:
+        bus, servo = self.bus_of(name)
+        return await bus.identify(servo)
+
+    async def scan(
+        self,
+        bus: str,
+        *,
+        baudrates: Iterable[int] = (),
+        ids: Iterable[int] = (),
+        progress: Callable[[int, int, Found | None], None] | None = None,
+    ) -> list[Found]:
+        if bus not in self.buses:
+            raise UnknownName(f"no bus {bus!r}: there are {', '.join(self.buses)}")
+        service = self.buses[bus]
+        every = PROTOCOLS[service.options.protocol].scan_ids
+        found = []
+        async for asked, count, entry in scan(service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)):
+            hit = None if entry is None else Found(bus, *entry)
+            if hit:
+                found.append(hit)
+            if progress:
+                progress(asked, count, hit)
+        return found
+
+    def stats(self) -> dict[str, Any]:
+        return {name: bus.snapshot() for name, bus in self.buses.items()}
+
+    async def _each(self, names: Iterable[str], verb: Callable[[BusService, str], Awaitable[None]]) -> None:
+        """Every servo is tried, whatever happens to another."""
+        full = self.full_names(names)
+        results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
+        _raise_failures(dict(zip(full, results, strict=True)))
+
+    @staticmethod
+    def _event(name: str, **fields: Any) -> None:
+        quiet = name in {"line_up", "echo_probed", "estop_cleared", "servo_online"}
+        (log.info if quiet else log.warning)(name, **fields)
+
+
+async def _outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
+    results = await asyncio.gather(*futures.values(), return_exceptions=True)
+    named = dict(zip(futures, results, strict=True))
+    _raise_failures(named)
+    return {name: result for name, result in named.items() if isinstance(result, Outcome)}
+
+
+def _raise_failures(results: Mapping[str, Any]) -> None:
+    """One result raises its own error; several raise PartialFailure. What is no error of ours is raised as it is."""
+    failures = [result for result in results.values() if isinstance(result, BaseException)]
+    for failure in failures:
+        if not isinstance(failure, ServobusError) or len(results) == 1:
+            raise failure
+    if failures:
+        raise PartialFailure(results)
+
+
+@asynccontextmanager
+async def open_rig(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> AsyncIterator[LocalRig]:
+    """This process owns the ports of `config` (a path, or a loaded Config) until the context ends; then each servo enabled here is
+    left as its `on_exit` says. `buses`: only these. `degraded`: ports that cannot be opened are waited for instead of raising.
+    Raises ConfigError, PortMissing, PortBusy, PortDenied, LinkDown."""
+    rig = LocalRig(config if isinstance(config, Config) else load_config(config), buses)
+    failure: BaseException | None = None
+    async with anyio.create_task_group() as keepers:
+        try:
+            for name in rig.buses:
+                keepers.start_soon(rig.keep, name)
+            await rig.ready(degraded=degraded)
+            yield rig
+        except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
+            failure = error
+        with anyio.CancelScope(shield=True):
+            await rig.leave()
+        keepers.cancel_scope.cancel()
+    if failure is not None:
+        raise failure

@@ -1,0 +1,187 @@
+"""The instructions of SMS 1.0 (seed 1.3 and 1.4) as requests that know their reply.
+
+An answer names the servo and nothing else, so `reply_key` is the number of its parameters: replies of one servo with the same key
+can be mistaken for each other. An own request heard back (echo) has the shape of a reply too; `plain()` gives the same question
+in a form whose echo cannot be an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+
+from servobus.protocols.base import Request
+from servobus.protocols.sms.codec import BROADCAST_ID, OVERHEAD, Instruction, Packet, encode
+
+R = TypeVar("R")
+
+ID_ADDRESS = 5
+"""The same in every memory table (seed 1.3.3)."""
+
+
+class SmsRequest(Request[R]):
+    """An instruction packet. `answered` says whether a reply is due."""
+
+    __slots__ = ("frame", "node", "nodes", "replies", "reply_key", "reply_size")
+
+    def __init__(self, node: int, instruction: Instruction, params: bytes = b"", *, size: int = 0, answered: bool = True) -> None:
+        self.node = node
+        self.nodes = (node,) if answered and node != BROADCAST_ID else ()
+        self.frame = encode(node, instruction, params)
+        self.replies = 1 if answered else 0
+        self.reply_size = OVERHEAD + size
+        self.reply_key: int = size
+
+    def answers(self, reply: Packet) -> bool:
+        return reply.id == self.node and len(reply.params) == self.reply_key
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.frame.hex(' ')})"
+
+
+class Ping(SmsRequest[int | None]):
+    """PING (1.3.1): the health byte. To the broadcast id any servo answers, so there must be only one."""
+
+    def __init__(self, node: int) -> None:
+        super().__init__(node, Instruction.PING)
+
+    def answers(self, reply: Packet) -> bool:
+        return not reply.params and (reply.id == self.node or self.node == BROADCAST_ID)
+
+    def parse(self, replies: Sequence[Packet]) -> int | None:
+        return replies[0].code
+
+    def plain(self) -> Request[int | None]:
+        """The echo of PING is a reply with status 1; a reply with one parameter has no such echo."""
+        return PingById(self.node)
+
+
+class PingById(SmsRequest[int | None]):
+    """READ of the id register, for its health byte."""
+
+    def __init__(self, node: int) -> None:
+        super().__init__(node, Instruction.READ, bytes((ID_ADDRESS, 1)), size=1)
+
+    def parse(self, replies: Sequence[Packet]) -> int | None:
+        return replies[0].code
+
+
+class Read(SmsRequest[R]):
+    """READ DATA (1.3.2) of `size` bytes from `address`; `decode` makes the value of them."""
+
+    __slots__ = ("address", "decode")
+
+    def __init__(self, node: int, address: int, size: int, decode: Callable[[bytes], R]) -> None:
+        super().__init__(node, Instruction.READ, bytes((address, size)), size=size)
+        self.address = address
+        self.decode = decode
+
+    def parse(self, replies: Sequence[Packet]) -> R:
+        return self.decode(replies[0].params)
+
+    def plain(self) -> Request[R] | None:
+        """The echo of a READ has two parameters, so it answers only a READ of two bytes: ask for three."""
+        if self.reply_key != 2:
+            return None
+        decode = self.decode
+        if self.address:
+            return Read(self.node, self.address - 1, 3, lambda data: decode(data[1:]))
+        return Read(self.node, 0, 3, lambda data: decode(data[:2]))
+
+
+class Fence(Read[bytes]):
+    """A READ from the id register on: its first byte must be the servo's own id, so it cannot be another register's value."""
+
+    idempotent = False  # said again it would look like the first: the next fence has another length
+
+    def __init__(self, node: int, size: int) -> None:
+        super().__init__(node, ID_ADDRESS, size, bytes)
+
+    def answers(self, reply: Packet) -> bool:
+        return reply.id == self.node and len(reply.params) == self.reply_key and reply.params[0] == self.node
+
+
+class Acknowledged(SmsRequest[int | None]):
+    """An instruction whose reply, where one is due, has no parameters: the health byte."""
+
+    def parse(self, replies: Sequence[Packet]) -> int | None:
+        return replies[0].code if replies else None
+
+
+class Write(Acknowledged):
+    """WRITE DATA (1.3.3). At response level 0, and to the broadcast id, nothing answers."""
+
+    def __init__(self, node: int, address: int, data: bytes, *, answered: bool = True) -> None:
+        super().__init__(node, Instruction.WRITE, _payload(address, data), answered=answered and node != BROADCAST_ID)
+
+
+class RegWrite(Acknowledged):
+    """REG WRITE (1.3.4): kept by the servo until ACTION."""
+
+    def __init__(self, node: int, address: int, data: bytes, *, answered: bool = True) -> None:
+        super().__init__(node, Instruction.REG_WRITE, _payload(address, data), answered=answered and node != BROADCAST_ID)
+
+
+class Action(Acknowledged):
+    """ACTION (1.3.5): to all it has no reply, to one servo it has. Never repeated: the first may have been carried out."""
+
+    idempotent = False
+
+    def __init__(self, node: int = BROADCAST_ID, *, answered: bool = True) -> None:
+        super().__init__(node, Instruction.ACTION, answered=answered and node != BROADCAST_ID)
+
+
+class Reset(Acknowledged):
+    """RESET (1.4.6): factory values. The reply may name id 1 already. Never to all, never repeated."""
+
+    idempotent = False
+
+    def __init__(self, node: int) -> None:
+        if node == BROADCAST_ID:
+            raise ValueError("RESET to the broadcast id would reset every servo of the line: name one")
+        super().__init__(node, Instruction.RESET)
+
+    def answers(self, reply: Packet) -> bool:
+        return not reply.params and reply.id in (self.node, 1)
+
+
+class SyncWrite(Acknowledged):
+    """SYNC WRITE (1.4.5): the same span of several servos in one packet, unanswered."""
+
+    def __init__(self, address: int, data: Mapping[int, bytes]) -> None:
+        sizes = {len(part) for part in data.values()}
+        if len(sizes) != 1 or 0 in sizes:
+            raise ValueError(f"SYNC WRITE needs the same number of bytes for each servo, found {sorted(sizes)}")
+        size = sizes.pop()
+        body = b"".join(bytes((node,)) + part for node, part in data.items())
+        super().__init__(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, size)) + body, answered=False)
+
+
+class SyncRead(SmsRequest[R]):
+    """SYNC READ (feetech.md, section 4): one reply per servo, in the order asked. A missing one spoils no other."""
+
+    __slots__ = ("decode",)
+    partial = True
+
+    def __init__(self, address: int, size: int, nodes: Sequence[int], decode: Callable[[Mapping[int, bytes]], R]) -> None:
+        super().__init__(BROADCAST_ID, Instruction.SYNC_READ, bytes((address, size, *nodes)), size=size)
+        self.nodes = tuple(nodes)
+        self.replies = len(self.nodes)
+        self.decode = decode
+
+    def answers(self, reply: Packet) -> bool:
+        return reply.id in self.nodes and len(reply.params) == self.reply_key
+
+    def parse(self, replies: Sequence[Packet]) -> R:
+        return self.decode({reply.id: reply.params for reply in replies})
+
+
+def sync_write_size(size: int, count: int) -> int:
+    """Bytes of a SYNC WRITE frame that carries `size` bytes for each of `count` servos."""
+    return OVERHEAD + 2 + (size + 1) * count
+
+
+def _payload(address: int, data: bytes) -> bytes:
+    if not data:
+        raise ValueError("a write without data says nothing: give at least one byte")
+    return bytes((address,)) + data

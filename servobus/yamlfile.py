@@ -1,0 +1,294 @@
+"""YAML that people write and strangers may send: a safe subset, read within limits, with the place of every value.
+
+Everything the project reads from YAML goes through here, so that each complaint can name `file:line:column`. Two rules hold for
+the file: what the text alone shows is refused before the parser sees it, because the parser's time and memory are not bounded
+by the text's length; and no more of the input than a few words ever stands in an error.
+
+Scalars follow the core schema of YAML 1.2 (`on` and `yes` are text), except that `010` is refused: YAML 1.1 read it as eight.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    CollectionStartEvent,
+    Event,
+    MappingEndEvent,
+    MappingStartEvent,
+    NodeEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+)
+
+from servobus.errors import ConfigError
+
+MAX_BYTES = 64 * 1024
+MAX_DEPTH = 16
+MAX_NODES = 5000
+"""Keys and values. The parser needs about 15 us for each, so this and not the size bounds its time."""
+MAX_INTEGER = (1 << 63) - 1
+MAX_SHOWN = 60
+"""Characters of the input that an error may repeat."""
+
+KeyPath: TypeAlias = tuple[str | int, ...]
+Place: TypeAlias = tuple[int, int]
+"""Line and column, from 1."""
+
+FORBIDDEN = re.compile(r"[^\n\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]")
+"""Tabs, byte-order marks, control characters, surrogates, and marks that turn the direction of writing."""
+FORBIDDEN_WORDS = {
+    "\t": "found a tab; use spaces",
+    "\ufeff": "found a byte-order mark; save the file as UTF-8 without one",
+}
+MARKER = re.compile(r"^(?:---(?=[ \n]|\Z)|\.\.\.(?=[ \n]|\Z)|%)", re.MULTILINE)
+BEFORE_DOCUMENT = re.compile(r"(?:[ ]*(?:#[^\n]*)?\n)*")
+BRACKET = re.compile(r"[\[\]{}]")
+TOO_DEEP = f"found more than {MAX_DEPTH} levels of nesting; flatten it"
+
+UNREADABLE: dict[type[Exception], str] = {
+    FileNotFoundError: "there is no such file; check the path",
+    IsADirectoryError: "this is a directory; name a YAML file in it",
+    PermissionError: "this user may not read it; check its owner and mode",
+}
+WORDS = dict.fromkeys(("", "~", "null", "Null", "NULL"), None) | {
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+INTEGER = re.compile(r"[-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+")
+LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
+FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """Plain data, and where each part of it stands."""
+
+    data: Any
+    name: str
+    places: dict[KeyPath, tuple[Place, Place]] = field(repr=False)
+    """Path -> where its key and where its value begins (the same for a list item)."""
+
+    def place(self, path: KeyPath, *, key: bool = False) -> Place:
+        """Line and column of a value, or of its key; of the nearest known ancestor's key where there is none."""
+        while path not in self.places:
+            path, key = path[:-1], True
+        return self.places[path][0 if key else 1]
+
+    def where(self, path: KeyPath, *, key: bool = False) -> str:
+        """The same as `name:line:column`."""
+        line, column = self.place(path, key=key)
+        return f"{self.name}:{line}:{column}"
+
+
+def read(path: Path | str) -> Document:
+    """The document in a file. Raises ConfigError, also for what the system says of the file."""
+    name = clip(str(path), 200)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        advice = next((text for kind, text in UNREADABLE.items() if isinstance(error, kind)), "cannot be read; check the path")
+        raise ConfigError(f"{name}: {advice}") from None
+    return parse(data, name)
+
+
+def parse(text: str | bytes, name: str) -> Document:
+    """The document in a text. Raises ConfigError with `name:line:column`, what was found and what to do."""
+    name = clip(name, 200)
+    text = _decode(text, name)
+    _scan(text, name)
+    events = YAML(typ="safe", pure=True).parse(text)
+    with closing(events):
+        return _Builder(name, events).document()
+
+
+def clip(text: str, length: int = MAX_SHOWN) -> str:
+    """At most so much of a text, on one line, fit to be shown."""
+    text = "".join(char if char.isprintable() else "?" for char in text[: length + 1])
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def _fail(name: str, place: Place, message: str) -> NoReturn:
+    raise ConfigError(f"{name}:{place[0]}:{place[1]}: {message}")
+
+
+def _place_of(text: str, index: int) -> Place:
+    return text.count("\n", 0, index) + 1, index - (text.rfind("\n", 0, index) + 1) + 1
+
+
+def _start(event: Event) -> Place:
+    return event.start_mark.line + 1, event.start_mark.column + 1
+
+
+# The linear scan
+
+
+def _decode(text: str | bytes, name: str) -> str:
+    """Text of bounded size, with Unix line ends."""
+    if len(text) > MAX_BYTES or (isinstance(text, str) and len(text.encode(errors="surrogatepass")) > MAX_BYTES):
+        _fail(name, (1, 1), f"found more than {MAX_BYTES} bytes; split the file, a config needs a few thousand")
+    if isinstance(text, str):
+        return text.replace("\r\n", "\n")
+    try:
+        return text.decode().replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        valid = text[: error.start].decode()
+        message = f"found byte 0x{text[error.start]:02X}, which is not UTF-8; save the file as UTF-8"
+        _fail(name, _place_of(valid, len(valid)), message)
+
+
+def _scan(text: str, name: str) -> None:
+    """Refuse what the text alone shows."""
+    if found := FORBIDDEN.search(text):
+        _fail(name, _place_of(text, found.start()), _forbidden(found[0]))
+    start = BEFORE_DOCUMENT.match(text)
+    for marker in MARKER.finditer(text):
+        place = _place_of(text, marker.start())
+        if marker[0] == "%":
+            _fail(name, place, "found a YAML directive (%); take the line out")
+        if marker[0] == "..." or (start and marker.start() != start.end()):
+            _fail(name, place, f"found {marker[0]}, the border of a second document; put each in a file of its own")
+    _scan_brackets(text, name)
+
+
+def _forbidden(char: str) -> str:
+    return FORBIDDEN_WORDS.get(char) or f"found the control character U+{ord(char):04X}; take it out"
+
+
+def _scan_brackets(text: str, name: str) -> None:
+    """The parser looks ahead through a line of open brackets in quadratic time. Brackets inside quotes count too: that errs on
+    the safe side, and seventeen of them left open are no part of a config. Indented nesting is counted as it is parsed."""
+    depth = 0
+    for bracket in BRACKET.finditer(text):
+        depth = depth + 1 if bracket[0] in "[{" else max(0, depth - 1)
+        if depth > MAX_DEPTH:
+            _fail(name, _place_of(text, bracket.start()), TOO_DEEP)
+
+
+# The parser's events made into data
+
+
+class _Builder:
+    """Turns events into data, and stops at the first one that has no place in a config."""
+
+    def __init__(self, name: str, events: Generator[Any, None, None]) -> None:
+        self.name = name
+        self.events = events
+        self.places: dict[KeyPath, tuple[Place, Place]] = {}
+        self.nodes = 0
+        self.last: Place = (1, 1)
+
+    def document(self) -> Document:
+        self.places[()] = ((1, 1), (1, 1))
+        data = None
+        while (event := self._next()) is not None:
+            if isinstance(event, NodeEvent):
+                data = self._node(event, (), 1)
+        return Document(data, self.name, self.places)
+
+    def _next(self) -> Event | None:
+        """The next event; the parser's own complaints in our words."""
+        try:
+            event: Event | None = next(self.events, None)
+        except MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            place = (mark.line + 1, mark.column + 1) if mark else self.last
+            problem = clip(str(error.problem or error.context), 100)
+            _fail(self.name, place, f"this is not YAML: {problem}; check colons, quotes, brackets and indentation here")
+        except (YAMLError, ValueError, OverflowError):
+            _fail(self.name, self.last, "behind this something is not YAML; check escapes in double quotes")
+        if event is not None:
+            self.last = _start(event)
+        return event
+
+    def _refuse(self, event: Event, message: str) -> NoReturn:
+        _fail(self.name, _start(event), message)
+
+    def _node(self, event: Event, path: KeyPath, depth: int) -> Any:
+        self._check(event, depth)
+        if isinstance(event, ScalarEvent):
+            return self._scalar(event)
+        if isinstance(event, MappingStartEvent):
+            return self._mapping(path, depth)
+        return self._sequence(path, depth)
+
+    def _check(self, event: Event, depth: int) -> None:
+        self.nodes += 1
+        if self.nodes > MAX_NODES:
+            self._refuse(event, f"found more than {MAX_NODES} keys and values; split the file")
+        if isinstance(event, AliasEvent):
+            self._refuse(event, "found an alias (*name); write the value out")
+        if not isinstance(event, (ScalarEvent, CollectionStartEvent)):
+            return
+        if event.anchor is not None:
+            self._refuse(event, "found an anchor (&name); take it out and write the value where it is needed")
+        if event.tag is not None:
+            self._refuse(event, "found a tag (!name); take it out, values have no types but their own")
+        if isinstance(event, CollectionStartEvent) and depth > MAX_DEPTH:
+            self._refuse(event, TOO_DEEP)
+
+    def _sequence(self, path: KeyPath, depth: int) -> list[Any]:
+        items: list[Any] = []
+        while (event := self._next()) is not None and not isinstance(event, SequenceEndEvent):
+            here = (*path, len(items))
+            self.places[here] = (_start(event), _start(event))
+            items.append(self._node(event, here, depth + 1))
+        return items
+
+    def _mapping(self, path: KeyPath, depth: int) -> dict[str | int, Any]:
+        data: dict[str | int, Any] = {}
+        while (event := self._next()) is not None and not isinstance(event, MappingEndEvent):
+            self._check(event, depth)
+            key = self._key(event)
+            here = (*path, key)
+            if key in data:
+                first = self.places[here][0][0]
+                self._refuse(event, f"found the key {clip(str(key))} again (first on line {first}); keep one of them")
+            value = self._next()
+            assert value is not None, "a key's event is followed by its value's"
+            self.places[here] = (_start(event), _start(value))
+            data[key] = self._node(value, here, depth + 1)
+        return data
+
+    def _key(self, event: Event) -> str | int:
+        if not isinstance(event, ScalarEvent):
+            self._refuse(event, "found a list or a mapping as a key; a key is a word or an integer")
+        if event.style is None and event.value == "<<":
+            self._refuse(event, "found a merge key (<<); write the keys out")
+        key = self._scalar(event)
+        if isinstance(key, bool) or not isinstance(key, (str, int)):
+            self._refuse(event, f"found {clip(event.value) or 'nothing'} as a key; use a word or an integer, or put it in quotes")
+        return key
+
+    def _scalar(self, event: ScalarEvent) -> Any:
+        text: str = event.value
+        if event.style is not None:
+            if found := FORBIDDEN.search(text):
+                self._refuse(event, f"in this text {_forbidden(found[0])}")
+            return text
+        if text in WORDS:
+            return WORDS[text]
+        if INTEGER.fullmatch(text):
+            return self._integer(event, text)
+        if NOT_FINITE.fullmatch(text) or (FLOAT.fullmatch(text) and not math.isfinite(float(text))):
+            self._refuse(event, f"found {clip(text)}; write a finite number, or put it in quotes if it is text")
+        return float(text) if FLOAT.fullmatch(text) else text
+
+    def _integer(self, event: Event, text: str) -> int:
+        if LEADING_ZERO.fullmatch(text):
+            self._refuse(event, f"found the leading zero of {clip(text)}; take it out, or put it in quotes if it is text")
+        number = int(text, 0) if len(text) <= 25 else MAX_INTEGER + 1
+        if abs(number) > MAX_INTEGER:
+            self._refuse(event, "found an integer beyond 64 bits; write a smaller one, or put it in quotes if it is text")
+        return number
