@@ -1,1 +1,58 @@
-"""servobus: one asyncio service that owns a robot's serial lines. These are the public names, and nothing else."""
+"""servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos."""
+
+from servobus.errors import (
+    ActionWithheld,
+    ConfigError,
+    DeviceError,
+    EchoMismatch,
+    EStopped,
+    GoalExpired,
+    LeaseHeld,
+    LimitError,
+    LinkDown,
+    NotEnabled,
+    NotSupported,
+    Overloaded,
+    PartialFailure,
+    PortBusy,
+    PortDenied,
+    PortMissing,
+    ReplyTimeout,
+    ServobusError,
+    UnknownName,
+)
+from servobus.local import open_rig as open  # noqa: A004 - `servobus.open` reads like the builtin because it is meant like it
+from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
+from servobus.rig import Found, Rig, Servo, Snapshot
+
+__all__ = [
+    "ActionWithheld",
+    "ConfigError",
+    "DeviceError",
+    "EStopped",
+    "EchoMismatch",
+    "Found",
+    "Goal",
+    "GoalExpired",
+    "Identity",
+    "LeaseHeld",
+    "LimitError",
+    "LinkDown",
+    "NotEnabled",
+    "NotSupported",
+    "Outcome",
+    "Overloaded",
+    "PartialFailure",
+    "PortBusy",
+    "PortDenied",
+    "PortMissing",
+    "ReplyTimeout",
+    "Rig",
+    "Servo",
+    "ServobusError",
+    "Snapshot",
+    "State",
+    "StopReport",
+    "UnknownName",
+    "open",
+]

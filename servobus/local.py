@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,9 +27,11 @@ from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
 from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
 from servobus.rig import Found, Rig, Snapshot
-from servobus.sim.build import simulated_link
+from servobus.sim.build import SimLink, simulated_link
 
 R = TypeVar("R")
+Trace = Callable[[str, bool, bytes, float], None]
+"""(bus, sent, bytes, monotonic seconds) of everything on the wire."""
 
 RETRY = 0.1
 """Seconds between two looks for a port that is not there."""
@@ -41,22 +44,24 @@ log = structlog.get_logger("servobus")
 class LocalRig(Rig):
     """Made by `servobus.open`, and alive as long as that context."""
 
-    def __init__(self, config: Config, only: Collection[str] = ()) -> None:
+    def __init__(self, config: Config, only: Collection[str] = (), trace: Trace | None = None) -> None:
         self.config = config
         self.buses: dict[str, BusService] = {}
-        self._links: dict[str, Link] = {}
+        self.links: dict[str, Link] = {}
         self._names: dict[str, tuple[str, str]] = {}
         self._tried: dict[str, asyncio.Event] = {}
         self._down: dict[str, LinkDown] = {}
         self._parking: set[asyncio.Task[None]] = set()
         for name in only or config.buses:
             self._add(name, config.buses[name])
+            if trace is not None:
+                self.buses[name].master.trace = partial(trace, name)
 
     def _add(self, name: str, options: BusOptions) -> None:
         entry, models = PROTOCOLS[options.protocol], self.config.models[name]
-        link = simulated_link(options, models) if options.port.startswith("sim:") else open_link(options)
+        link = simulated_link(options, models) if options.port.startswith("sim:") else open_link(options.port, options.baudrate, rs485=options.rs485)
         driver = entry.driver(options, models)
-        self._links[name] = link
+        self.links[name] = link
         self.buses[name] = BusService(name, options, driver, entry.codec(), link.traits, self._event)
         self._tried[name] = asyncio.Event()
         self._names.update({f"{name}/{servo}": (name, servo) for servo in driver.nodes})
@@ -74,7 +79,7 @@ class LocalRig(Rig):
 
     async def keep(self, name: str) -> None:
         """Open the line, and again whenever it is gone. Ends by being cancelled."""
-        bus, link = self.buses[name], self._links[name]
+        bus, link = self.buses[name], self.links[name]
         while True:
             try:
                 await link.connect(bus.master)
@@ -112,6 +117,9 @@ class LocalRig(Rig):
                         self._event("exit_unconfirmed", bus=bus, servo=servo, action=entry.action, detail=entry.detail)
         for service in self.buses.values():
             service.master.close()
+        for link in self.links.values():
+            if isinstance(link, SimLink):
+                link.close()
 
     # Motion
 
@@ -268,11 +276,14 @@ def _raise_failures(results: Mapping[str, Any]) -> None:
 
 
 @asynccontextmanager
-async def open_rig(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> AsyncIterator[LocalRig]:
+async def open_rig(
+    config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False, trace: Trace | None = None
+) -> AsyncIterator[LocalRig]:
     """This process owns the ports of `config` (a path, or a loaded Config) until the context ends; then each servo enabled here is
     left as its `on_exit` says. `buses`: only these. `degraded`: ports that cannot be opened are waited for instead of raising.
+    `trace` is called with every piece of bytes on the wire, both ways.
     Raises ConfigError, PortMissing, PortBusy, PortDenied, LinkDown."""
-    rig = LocalRig(config if isinstance(config, Config) else load_config(config), buses)
+    rig = LocalRig(config if isinstance(config, Config) else load_config(config), buses, trace)
     failure: BaseException | None = None
     async with anyio.create_task_group() as keepers:
         try:

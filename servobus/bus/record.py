@@ -12,7 +12,18 @@ from servobus.protocols.options import ServoOptions
 class ServoRecord:
     """Host-side state of a servo. Fields of State come from replies; `enabled` is our own doing."""
 
-    __slots__ = ("_fields", "enabled", "identity", "name", "node", "options", "position_at", "setpoint", "updated_at")
+    __slots__ = (
+        "_fields",
+        "enabled",
+        "identity",
+        "introduce_after",
+        "name",
+        "node",
+        "options",
+        "position_at",
+        "setpoint",
+        "updated_at",
+    )
 
     def __init__(self, name: str, options: ServoOptions, node: Node) -> None:
         self.name = name
@@ -20,6 +31,8 @@ class ServoRecord:
         self.node = node
         self.enabled = False
         self.identity: Identity | None = None
+        self.introduce_after = 0.0
+        """Not before this is an unknown servo asked again who it is."""
         self.setpoint: float | None = None
         """The last position asked for, or held."""
         self.position_at: float | None = None

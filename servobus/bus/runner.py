@@ -71,6 +71,7 @@ class Runner:
                 return None
             run = Run(job)
             self._run = run
+            self.stats.counts["fences"] += job.recovery
             self._step(run, run.begin)
         return self._run
 

@@ -39,6 +39,8 @@ R = TypeVar("R")
 PATIENCE = 2.0
 """Seconds a request may wait for its turn."""
 TOLERANCE_STEPS = 10
+INTRODUCTION_PAUSE = 1.0
+"""Seconds between two attempts to learn who a servo is that answers, but not to that."""
 DOWN_PAUSE = 0.02
 """A caller that asks again and again while the line is down is answered this slowly, so that it does not burn the core."""
 
@@ -217,8 +219,10 @@ class BusService:
         names = [record.name for record in self.on(node)]
         if Condition.OFFLINE in (node.condition, before):
             self.event(f"servo_{node.condition}", bus=self.name, servo=",".join(names), id=node.id)
+        now = self.clock()
         for record in self.on(node):
-            if node.condition is Condition.ONLINE and record.identity is None:
+            if node.condition is Condition.ONLINE and record.identity is None and now >= record.introduce_after:
+                record.introduce_after = now + INTRODUCTION_PAUSE
                 self._introduce_later(record)
 
     def _introduce_later(self, record: ServoRecord) -> None:

@@ -141,8 +141,11 @@ def _step(plan: Generator[Request[Any], Any, Any], value: Any) -> Request[Any]:
 
 
 def judge(codec: Codec, turn: Turn, strays: list[Reply]) -> bool:
-    """Hear out what the codec holds. True: the turn has all its answers and the window ends with a whole frame."""
+    """Hear out what the codec holds. True: the turn has all its answers and the window ends with a whole frame, not with bytes that
+    are none: with an 8-bit sum, those behind a frame may be what is left of another that was cut in two by accident."""
+    skipped = codec.skipped
     while (reply := codec.next_reply()) is not None:
+        skipped = codec.skipped
         if not turn.offer(reply):
             strays.append(reply)
-    return turn.complete() and not codec.pending
+    return turn.complete() and not codec.pending and codec.skipped == skipped

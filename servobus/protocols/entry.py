@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 from typing import Any
 
 from servobus.protocols.base import Codec, Device, Driver
@@ -27,6 +28,10 @@ class ProtocolEntry:
     """For the devices' end of the line."""
     devices: Callable[[Any, Mapping[str, Any]], Sequence[Device]]
     """The simulated halves of the bus's servos."""
+    rename: Callable[[bytes, Random], bytes]
+    """A reply frame in the name of another node, checksum right: for the fault injector."""
+    node_of: Callable[[bytes], int]
+    """The node that a reply frame names."""
     baudrates: tuple[int, ...]
     """Rates a scan tries, the likely ones first."""
     scan_ids: range

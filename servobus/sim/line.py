@@ -15,7 +15,7 @@ from itertools import groupby
 from operator import attrgetter
 
 from servobus.protocols.base import Codec, Device, DeviceReply
-from servobus.timerfd import FineTimer
+from servobus.timerfd import FineTimer, clock_of
 
 TOLERANCE = 0.03
 """How far two baud rates may be apart and still understand each other."""
@@ -48,7 +48,8 @@ class SimLine:
         """Times that two spoke at once."""
         self._codec = codec
         self._loop = loop
-        self._baudrate = baudrate
+        self._now = clock_of(loop)
+        self.baudrate = baudrate
         self._byte_time = 10.0 / baudrate
         self._deliver: Callable[[bytes], None] = _nobody
         self._said_until = 0.0
@@ -58,13 +59,17 @@ class SimLine:
         self._timer = FineTimer(loop, self._on_time) if wire_time else None
         self._closed = False
 
+    def backlog(self) -> float:
+        """Seconds until everything the master gave it is said."""
+        return max(0.0, self._said_until - self._now())
+
     def attach(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver
 
     def set_baudrate(self, baudrate: int) -> None:
         """What was on its way at another rate is understood by nobody."""
-        if baudrate != self._baudrate:
-            self._baudrate = baudrate
+        if baudrate != self.baudrate:
+            self.baudrate = baudrate
             self._byte_time = 10.0 / baudrate
             self._codec.reset()
             self._sayings.clear()
@@ -87,7 +92,7 @@ class SimLine:
     # Without wire time
 
     def _hear_at_once(self, data: bytes) -> None:
-        now = self._loop.time()
+        now = self._now()
         self._codec.receive_data(data)
         while (packet := self._codec.next_reply()) is not None:
             replies = self._ask(packet, now)
@@ -119,7 +124,7 @@ class SimLine:
 
     def _hear(self, data: bytes, timer: FineTimer) -> None:
         """The bytes go out behind what is still being said, one byte time each."""
-        begin = max(self._loop.time(), self._said_until)
+        begin = max(self._now(), self._said_until)
         self._said_until = end = begin + len(data) * self._byte_time
         master = Saying(begin, end, data)
         self._clash(master)
@@ -172,17 +177,17 @@ class SimLine:
 
     def _on_time(self) -> None:
         """Deliver what has been said by now."""
-        now = self._loop.time()
+        now = self._now()
         while self._sayings and self._sayings[0].end <= now:
             self._deliver(self._sayings.pop(0).data)
         if self._sayings and self._timer:
             self._timer.arm(self._sayings[0].end)
 
     def _ask(self, packet: object, now: float) -> list[DeviceReply]:
-        near = TOLERANCE * self._baudrate
+        near = TOLERANCE * self.baudrate
         replies: list[DeviceReply] = []
         for device in self.devices:
-            if abs(device.baudrate - self._baudrate) <= near:
+            if abs(device.baudrate - self.baudrate) <= near:
                 replies += device.handle(packet, now)
         return replies
 

@@ -12,6 +12,7 @@ import os
 import struct
 import termios
 import tty
+from collections.abc import Callable
 from pathlib import Path
 
 from servobus.links.base import FarEnd
@@ -20,16 +21,28 @@ TCGETS2 = 0x802C542A
 TERMIOS2 = struct.Struct("4I B 19B 2I")
 """struct termios2: it tells custom rates too, which termios cannot. The last field is the output speed."""
 CHUNK = 4096
+FULL, HALF = 0.1, 0.05
+"""Seconds of unsaid bytes at which it stops reading, and goes on. What it does not read fills the system's buffer, and then its
+user waits, as with a UART."""
 
 
 class SimPty:
     """Open from the start. `path` is what a user opens: the link if one was asked for."""
 
-    def __init__(self, far: FarEnd, loop: asyncio.AbstractEventLoop, *, symlink: Path | None = None) -> None:
+    def __init__(
+        self,
+        far: FarEnd,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        backlog: Callable[[], float] = float,
+        symlink: Path | None = None,
+    ) -> None:
+        """`backlog` tells how many seconds the line needs to say what it was given."""
         self.dropped = 0
         """Bytes that nobody read, so that there was no room for them."""
         self._far = far
         self._loop = loop
+        self._backlog = backlog
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -68,6 +81,13 @@ class SimPty:
         if speed := self.baudrate():  # 0 hangs up
             self._far.set_baudrate(speed)
         self._far.receive(data)
+        if (unsaid := self._backlog()) > FULL:
+            self._loop.remove_reader(self._master)
+            self._loop.call_later(unsaid - HALF, self._go_on)
+
+    def _go_on(self) -> None:
+        if self._master >= 0:
+            self._loop.add_reader(self._master, self._read)
 
     def _write(self, data: bytes) -> None:
         """A UART waits for nobody: what finds no room is lost, and counted."""

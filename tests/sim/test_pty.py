@@ -6,12 +6,13 @@ import asyncio
 import errno
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import serial
 
-from servobus.sim.pty import SimPty
+from servobus.sim.pty import FULL, HALF, SimPty
 
 
 class Parrot:
@@ -90,6 +91,40 @@ async def test_what_nobody_reads_is_dropped_and_counted() -> None:
     pty.close()
 
 
+async def test_a_user_who_says_too_much_waits() -> None:
+    """As with a UART: behind a slow line the buffers fill, and what is in them is not lost but late."""
+    parrot, unsaid = Parrot(), [FULL, FULL + 0.01]
+    pty = SimPty(parrot, asyncio.get_running_loop(), backlog=lambda: unsaid.pop(0))
+    with serial.Serial(pty.path, 115_200) as port:
+        for word in (b"first", b"second"):
+            port.write(word)
+            assert await parrot.news() == [115_200, word]
+        os.set_blocking(port.fileno(), False)
+        said = 0
+        with suppress(BlockingIOError):
+            while said < 1_000_000:
+                said += os.write(port.fileno(), bytes(1000))
+        assert said < 1_000_000
+        unsaid += [0.0] * said
+        heard = 0
+        while heard < said:
+            heard += sum(len(part) for part in await parrot.news() if isinstance(part, bytes))
+        assert heard == said
+    pty.close()
+
+
+async def test_the_plug_can_be_pulled_while_a_user_waits() -> None:
+    """Nothing goes on then."""
+    parrot = Parrot()
+    pty = SimPty(parrot, asyncio.get_running_loop(), backlog=lambda: HALF + FULL)
+    with serial.Serial(pty.path, 115_200) as port:
+        port.write(b"x")
+        await parrot.news()
+        pty.close()
+        await asyncio.sleep(FULL + HALF)
+        assert parrot.said == []
+
+
 async def test_closing_pulls_the_plug() -> None:
     """The user gets an error, the path is gone, and what is said then goes nowhere."""
     parrot = Parrot()
@@ -102,7 +137,8 @@ async def test_closing_pulls_the_plug() -> None:
     os.close(user)
     parrot.deliver(b"x")
     pty.close()
-    assert not os.path.exists(pty.path)
+    with pytest.raises(FileNotFoundError):
+        os.stat(pty.path)
 
 
 async def test_a_stable_name_follows_the_plug(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """FEETECH SMS 1.0 and its relatives (STS, SCS): the seed's instruction packets on RS485 or TTL."""
 
 from servobus.protocols.entry import ProtocolEntry
-from servobus.protocols.sms.codec import MAX_ID, SmsCodec
+from servobus.protocols.sms.codec import MAX_ID, SmsCodec, node_of, rename
 from servobus.protocols.sms.device import devices
 from servobus.protocols.sms.driver import SmsDriver
 from servobus.protocols.sms.load import load_models
@@ -14,6 +14,8 @@ ENTRY = ProtocolEntry(
     driver=SmsDriver,
     device_codec=SmsCodec,
     devices=devices,
+    rename=rename,
+    node_of=node_of,
     # feetech.md, section 5: what the families ship with comes first.
     baudrates=(1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400, 19_200, 14_400, 9_600, 4_800),
     scan_ids=range(MAX_ID + 1),

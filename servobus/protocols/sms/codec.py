@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from random import Random
 from typing import NamedTuple
 
 HEADER = b"\xff\xff"
@@ -129,6 +130,16 @@ class SmsCodec:
     def _drop(self, count: int) -> None:
         self.skipped += count
         self._buffer = self._buffer[count:]
+
+
+def rename(frame: bytes, rng: Random) -> bytes:
+    """The same packet in the name of another servo."""
+    return encode((frame[2] + rng.randint(1, MAX_ID)) % (MAX_ID + 1), frame[4], frame[5:-1])
+
+
+def node_of(frame: bytes) -> int:
+    """The id of a whole packet."""
+    return frame[len(HEADER)]
 
 
 def describe(frame: bytes, *, sent: bool) -> str:

@@ -21,6 +21,9 @@ from servobus.protocols.sms.options import SmsBus
 SHORTEST_DELAY = 50
 """A return delay below this, but not 0, acts as this (units of 2 us; feetech.md, section 2)."""
 
+REBOOT = 0x08
+"""Newer than the seed, and never answered (feetech.md, section 4)."""
+
 Answer: TypeAlias = tuple[int, bytes] | None
 """Place among the answers, and parameters; None: silence."""
 
@@ -62,7 +65,9 @@ class SmsDevice(ServoBody):
     # Instructions
 
     def ping(self, packet: Packet, now: float) -> Answer:
-        return 0, b""
+        """Asked all at once, newer servos answer one after another by id: clients count on it. Older ones all speak at once."""
+        in_turn = self.model.sync_read and packet.id == BROADCAST_ID
+        return self.node if in_turn else 0, b""
 
     def read(self, packet: Packet, now: float) -> Answer:
         if len(packet.params) != 2:
@@ -91,6 +96,10 @@ class SmsDevice(ServoBody):
     def factory(self, packet: Packet, now: float) -> Answer:
         self.reset(now)
         return 0, b""
+
+    def power_cycle(self, packet: Packet, now: float) -> Answer:
+        self.reboot(now)
+        return None
 
     def sync_write(self, packet: Packet, now: float) -> Answer:
         """Its own part of the packet, which has a whole number of parts."""
@@ -125,6 +134,7 @@ VERBS: dict[int, Callable[[SmsDevice, Packet, float], Answer]] = {
     Instruction.REG_WRITE: SmsDevice.reg_write,
     Instruction.ACTION: SmsDevice.action,
     Instruction.RESET: SmsDevice.factory,
+    REBOOT: SmsDevice.power_cycle,
     Instruction.SYNC_READ: SmsDevice.sync_read,
     Instruction.SYNC_WRITE: SmsDevice.sync_write,
 }

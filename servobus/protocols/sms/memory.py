@@ -41,7 +41,7 @@ class MemoryTable:
         self.restart()
 
     def get(self, register: Register) -> int:
-        return register.decode(self.data[register.address : register.end], self._order)
+        return register.decode(bytes(self.data[register.address : register.end]), self._order)
 
     def put(self, register: Register, raw: int) -> None:
         """Change what the servo works with; what is out of range ends at the end of the range."""

@@ -1,0 +1,40 @@
+"""Simulated buses for other programs: one PTY a bus, until cancelled. What `servobus sim` runs.
+
+The `port` of a bus plays no part. Bytes take their time at the rate that the PTY's user set, and a servo hears only its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import anyio
+
+from servobus.protocols.model import ServoModel
+from servobus.protocols.options import BusOptions
+from servobus.sim.build import far_end, simulated_line
+from servobus.sim.pty import SimPty
+
+
+async def serve(
+    buses: Mapping[str, BusOptions],
+    models: Mapping[str, Mapping[str, ServoModel]],
+    announce: Callable[[str, str], None],
+    *,
+    folder: Path | None = None,
+) -> None:
+    """`announce` is told name and path of each bus, once all can be opened. `models`: those of each bus, by bus name. `folder`:
+    where each path is a link with the name of its bus; its files are left alone. Raises FileExistsError, OSError."""
+    loop = asyncio.get_running_loop()
+    with ExitStack() as stack:
+        paths = {}
+        for name, options in buses.items():
+            line = stack.enter_context(closing(simulated_line(options, models[name], loop)))
+            symlink = folder / name if folder else None
+            far = far_end(options, line, loop)
+            paths[name] = stack.enter_context(closing(SimPty(far, loop, backlog=line.backlog, symlink=symlink))).path
+        for name, path in paths.items():
+            announce(name, path)
+        await anyio.sleep_forever()

@@ -1,0 +1,57 @@
+"""What `scripts/soak` and `scripts/bench` run: long campaigns that print their figures."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+
+from tests.campaigns import faults, line, turns
+
+
+def soak_faults(count: int) -> bool:
+    result = faults.faults(count)
+    result.report("1 % mixed faults, replies delivered whole")
+    residual = faults.faults(count // 10, chop="bytes")
+    residual.report("the same, delivered byte by byte (the residual of an 8-bit sum)")
+    return not (result.wrong or result.leaked or result.waiting)
+
+
+def soak_cancel(count: int) -> bool:
+    result = faults.cancel(count // 10)
+    result.report("cancelled callers")
+    return not (result.wrong or result.leaked or result.waiting)
+
+
+def soak_line(_: int) -> bool:
+    figures = line.main()
+    return figures.rate_with_dead >= 0.8 * figures.rate_before and figures.unplug < 0.05 and figures.replug < 0.25 and figures.cpu < 0.02
+
+
+def bench_turns(_: int) -> bool:
+    ratios = turns.main()
+    best = ratios["servobus, 12 callers, uvloop"]
+    return best >= 0.45 and best > ratios["feetech-servo-sdk"]
+
+
+CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
+    "soak": {"faults": soak_faults, "cancel": soak_cancel, "line": soak_line},
+    "bench": {"turns": bench_turns},
+}
+
+
+def main() -> int:
+    """Status 1 when a figure misses what it has to reach."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=CAMPAIGNS)
+    parser.add_argument("campaigns", nargs="*", help="which; all if none is named")
+    parser.add_argument("--count", type=int, default=1_000_000, help="reads of the faults campaign, ten times the cancels")
+    arguments = parser.parse_args()
+    known = CAMPAIGNS[arguments.kind]
+    if unknown := set(arguments.campaigns) - set(known):
+        parser.error(f"no {arguments.kind} campaign {', '.join(sorted(unknown))}: there are {', '.join(known)}")
+    kept = [known[name](arguments.count) for name in arguments.campaigns or known]
+    return 0 if all(kept) else 1
+
+
+sys.exit(main())

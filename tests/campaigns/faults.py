@@ -1,0 +1,116 @@
+"""A faulty line in virtual time: how many values were wrong, how many awaits hung, how many tasks were left behind.
+
+`faults` damages one reply in a hundred in every way there is; `cancel` cancels callers at random points of a faulty line. The
+values come from an oracle, so every wrong one is seen. A hung await ends the campaign: the virtual loop notices when all wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from dataclasses import dataclass, field
+from typing import Literal
+
+from servobus.errors import ReplyTimeout
+from servobus.protocols.options import FaultOptions
+from tests.campaigns.oracle import SERVOS, Oracle, service
+from tests.virtual import VirtualLoop
+
+KINDS = ("loss", "late", "duplicate", "truncate", "drop_byte", "insert_byte", "flip", "wrong_id", "echo")
+LATE_MS = 100.0
+"""Five times the deadline that a node begins with."""
+
+
+@dataclass(slots=True)
+class Result:
+    """What a campaign found."""
+
+    reads: int = 0
+    wrong: int = 0
+    timeouts: int = 0
+    cancelled: int = 0
+    turns: int = 0
+    leaked: int = 0
+    waiting: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def report(self, title: str) -> None:
+        print(
+            f"{title}: {self.turns} turns, {self.reads} values, {self.wrong} wrong, {self.timeouts} timeouts, "
+            f"{self.cancelled} cancelled, 0 hung, {self.leaked} leaked tasks, {self.waiting} still queued"
+        )
+        print("   " + ", ".join(f"{name} {count}" for name, count in sorted(self.counts.items())))
+
+
+def options(share: float, *, chop: Literal["whole", "bytes", "random"] = "whole", seed: int = 1) -> FaultOptions:
+    """Every kind of fault, together `share` of all replies."""
+    each = dict.fromkeys(KINDS, share / len(KINDS))
+    return FaultOptions(**each, chop=chop, delay_ms=LATE_MS, seed=seed)
+
+
+def faults(reads: int, *, share: float = 0.01, chop: Literal["whole", "bytes", "random"] = "whole", seed: int = 1) -> Result:
+    """So many reads by twelve callers of ten servos."""
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(_faults(reads, options(share, chop=chop, seed=seed), seed))
+
+
+async def _faults(reads: int, damage: FaultOptions, seed: int) -> Result:
+    result = Result()
+    bus, link, oracle = service(SERVOS, damage)
+    await link.connect(bus.master)
+    await bus.start()
+
+    async def caller(number: int) -> None:
+        rng = random.Random(f"{seed}/{number}")
+        while result.reads + result.timeouts < reads:
+            await _read(bus, oracle, rng, result, number % SERVOS + 1 if number < SERVOS else rng.randrange(SERVOS) + 1)
+
+    await asyncio.gather(*(caller(number) for number in range(SERVOS + 2)))
+    return _end(bus, result)
+
+
+async def _read(bus, oracle: Oracle, rng: random.Random, result: Result, node: int) -> None:  # type: ignore[no-untyped-def]
+    address, size = rng.choice(((56, 2), (58, 2), (56, 4), (56, 6), (40, 3), (56, 15)))
+    asked = asyncio.get_running_loop().time()
+    try:
+        value = await bus.read_register(f"s{node}", f"{address}:{size}")
+    except ReplyTimeout:
+        result.timeouts += 1
+    else:
+        result.reads += 1
+        result.wrong += not oracle.right(value, node, address, asked)
+
+
+def _end(bus, result: Result) -> Result:  # type: ignore[no-untyped-def]
+    result.turns = bus.stats.counts["turns"]
+    result.waiting = bus.scheduler.waiting()
+    result.counts = dict(bus.stats.counts)
+    bus.master.close()
+    result.leaked = len(asyncio.all_tasks()) - 1
+    return result
+
+
+def cancel(cancels: int, *, seed: int = 1) -> Result:
+    """So many callers cancelled, each at a random moment of its call."""
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(_cancel(cancels, seed))
+
+
+async def _cancel(cancels: int, seed: int) -> Result:
+    result, rng = Result(), random.Random(seed)
+    bus, link, oracle = service(SERVOS, options(0.01, seed=seed))
+    await link.connect(bus.master)
+    await bus.start()
+    while result.cancelled < cancels:
+        tasks = [asyncio.create_task(_read(bus, oracle, rng, result, rng.randrange(SERVOS) + 1)) for _ in range(8)]
+        for task in rng.sample(tasks, 5):
+            for _ in range(rng.randrange(4)):
+                await asyncio.sleep(0)
+            task.cancel()
+        for ended in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(ended, asyncio.CancelledError):
+                result.cancelled += 1
+            elif ended is not None:
+                raise ended
+    await asyncio.sleep(5)
+    return _end(bus, result)

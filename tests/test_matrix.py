@@ -1,0 +1,95 @@
+"""Every verb over every kind of delivery, in memory and on a PTY: the right value, or a typed error where replies are lost."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+import pytest
+
+from servobus.errors import ServobusError
+from servobus.local import LocalRig, open_rig
+from servobus.protocols.base import Outcome
+from tests.rigs import config, pty_rig
+from tests.virtual import virtual
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What the line does to replies. `lossy`: a verb may end in a typed error."""
+
+    faults: str
+    lossy: bool = False
+    echo: str = "off"
+
+
+MATRIX = {
+    "whole": Delivery("{}"),
+    "bytes": Delivery("{chop: bytes}"),
+    "random": Delivery("{chop: random, seed: 7}"),
+    "loss": Delivery("{loss: 0.2, seed: 3}", lossy=True),
+    "delay": Delivery("{late: 0.2, delay_ms: 40, seed: 5}", lossy=True),
+    "echo": Delivery("{echo: 1.0}", echo="auto"),
+    "noise": Delivery("{noise: 1.0, seed: 2}"),
+}
+
+Verb = tuple[Callable[[LocalRig], Awaitable[object]], Callable[[object], bool]]
+VERBS: dict[str, Verb] = {
+    "ping": (lambda rig: rig.ping("s1"), lambda status: status == 0),
+    "identify": (lambda rig: rig.identify("s2"), lambda found: getattr(found, "model", None) == "sts"),
+    "read": (lambda rig: rig.read("s1"), lambda state: abs(getattr(state, "position", 99)) < 0.1),
+    "read_register": (lambda rig: rig.read_register("s2", "id"), lambda value: value == 2),
+    "read_span": (lambda rig: rig.read_register("s3", "5:1"), lambda value: value == [3]),
+    "write_register": (lambda rig: rig.write_register("s2", "torque_limit", 50), lambda value: value == 50),
+    "persist": (lambda rig: rig.write_register("s3", "return_delay", 100, raw=True, persist=True), lambda value: value == 100),
+    "scan": (lambda rig: rig.scan("arm", ids=range(5)), lambda found: [hit.id for hit in found] == [1, 2, 3]),  # type: ignore[attr-defined]
+    "enable": (lambda rig: rig.enable(), lambda done: done is None),
+    "write": (lambda rig: rig["s1"].move_to(10), lambda outcome: outcome is Outcome.ACKED),
+    "sync_write": (
+        lambda rig: rig.move({"s1": 5, "s2": -5}),
+        lambda results: results == {"arm/s1": Outcome.SENT, "arm/s2": Outcome.SENT},
+    ),
+    "reg_write": (
+        lambda rig: rig.move({"s1": 8, "s2": -8}, together=True, confirm=True),
+        lambda results: results == {"arm/s1": Outcome.ACKED, "arm/s2": Outcome.ACKED},
+    ),
+    "settle": (
+        lambda rig: rig.settle("s1", "s2"),
+        lambda states: all(abs(abs(state.position) - 8) < 1 for state in states.values()),  # type: ignore[attr-defined]
+    ),
+    "disable": (lambda rig: rig.disable("s2"), lambda done: done is None),
+    "stop": (lambda rig: rig.stop(), lambda reports: set(reports) == {"arm/s1", "arm/s2", "arm/s3"}),  # type: ignore[call-overload]
+    "clear": (lambda rig: rig.clear(), lambda done: done is None),
+}
+
+
+async def _every_verb(rig: LocalRig, delivery: Delivery) -> None:
+    ended = {}
+    for name, (verb, right) in VERBS.items():
+        async with asyncio.timeout(30):
+            try:
+                result = await verb(rig)
+            except ServobusError as error:
+                assert delivery.lossy, f"{name}: {error!r}"
+                ended[name] = False
+            else:
+                assert right(result), f"{name}: {result!r}"
+                ended[name] = True
+    assert ended["stop"]
+    assert sum(ended.values()) > len(ended) / 2, ended
+
+
+@pytest.mark.parametrize("kind", MATRIX)
+@virtual
+async def test_in_memory(kind: str) -> None:
+    delivery = MATRIX[kind]
+    async with open_rig(config(faults=delivery.faults, echo=delivery.echo, poll="{feedback: 50}")) as rig:
+        await _every_verb(rig, delivery)
+
+
+@pytest.mark.parametrize("kind", MATRIX)
+async def test_on_a_pty(kind: str) -> None:
+    delivery = MATRIX[kind]
+    async with pty_rig(config(faults=delivery.faults, echo=delivery.echo, poll="{feedback: 50}")) as rig:
+        await _every_verb(rig, delivery)
