@@ -26,6 +26,9 @@ POLL_PATIENCE = 1.0
 """Seconds after which a poll that could not be sent is not wanted any more."""
 
 
+OFFLINE = "it is offline: is it powered, are id and baud rate right? It is probed, and served again as soon as it answers"
+
+
 @dataclass(slots=True)
 class PollTimer:
     """A poll on a fixed grid: `due` moves by whole periods, so a late poll does not shift the next one."""
@@ -146,7 +149,7 @@ class Scheduler:
         if late:
             self._parked = [job for job in self._parked if job not in late]
             for job in late:
-                job.fail(ReplyTimeout("the servo is offline: it is probed, and served again when it answers"))
+                job.fail(ReplyTimeout(OFFLINE, request=job.request, raw=job.request.frame if job.request else b""))
 
     def node_changed(self, node: Node) -> None:
         """Jobs set aside for a node that came back go on; those in the queue of one that went offline are set aside."""
