@@ -156,6 +156,7 @@ class BusMaster(asyncio.Protocol):
         self.runner.strays(strays, None, now)
         if self._turn is None:
             self.line.listen_out(now)
+            self._pump()  # who spoke is to be asked again, when it is quiet
 
     # Turns
 

@@ -1,0 +1,59 @@
+"""A scan asks every id at every rate, once, alone on the line, and leaves it as it was."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import aclosing
+
+import pytest
+
+from servobus.bus.scan import scan
+from servobus.errors import LinkDown
+from servobus.protocols.sms.codec import Instruction
+from tests.bus.puppet import puppet_bus
+from tests.virtual import virtual
+
+
+@virtual
+async def test_every_id_at_every_rate() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        puppet.script = lambda frame: [] if frame[2] not in (1, 5) else None
+        steps = [step async for step in scan(bus, [1_000_000, 500_000], range(8))]
+        assert [step[:2] for step in steps] == [(asked, 16) for asked in range(1, 17)]
+        hits = [step[2] for step in steps if step[2] is not None]
+        assert [(hit[0], hit[1]) for hit in hits] == [(1, 1_000_000), (5, 1_000_000), (1, 500_000), (5, 500_000)]
+        pinged = [frame[2] for frame in puppet.heard if frame[4] == Instruction.PING]
+        assert set(pinged) == set(range(8))
+        assert bus.scheduler.session is None
+
+
+@virtual
+async def test_a_scan_that_is_left_gives_the_line_back_at_its_own_rate() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        own = bus.options.baudrate
+        async with aclosing(scan(bus, [500_000, own], range(8))) as steps:
+            await anext(steps)
+            assert bus.line.traits.baudrate == 500_000
+        assert bus.line.traits.baudrate == own
+        assert bus.scheduler.session is None
+        assert await bus.read_register("s1", "present_position", raw=True) == 0
+
+
+@virtual
+async def test_a_servo_that_answers_only_ping_is_found_without_a_name() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        puppet.script = lambda frame: None if frame[4] == Instruction.PING and frame[2] == 9 else []
+        hits = [hit async for _, _, hit in scan(bus, [bus.options.baudrate], [9]) if hit]
+        assert len(hits) == 1
+        assert hits[0][2] is None
+
+
+@virtual
+async def test_a_line_that_goes_down_ends_the_scan() -> None:
+    async with puppet_bus() as (bus, puppet, link, _):
+        puppet.script = lambda frame: []
+        asyncio.get_running_loop().call_later(0.1, link.unplug)
+        with pytest.raises(LinkDown):
+            async for _ in scan(bus, [bus.options.baudrate], range(200)):
+                pass
+        assert bus.scheduler.session is None
