@@ -13,6 +13,10 @@ from servobus.errors import GoalExpired, ServobusError
 from servobus.protocols.base import Outcome, ServoGoal
 
 
+def _never() -> bool:
+    return False
+
+
 @dataclass(slots=True, eq=False)
 class Ticket:
     """A goal under way. `done` is called exactly once."""
@@ -24,6 +28,8 @@ class Ticket:
     batch: int | None = None
     """Tickets with the same batch leave together."""
     confirm: bool = False
+    gone: Callable[[], bool] = _never
+    """Whether its caller has left: then it is dropped, and nobody is told."""
 
     @property
     def servo(self) -> str:
@@ -63,7 +69,7 @@ class Coalescer:
             self._tickets[ticket.servo] = ticket
 
     def take(self, now: float, ready: Collection[int]) -> Group | None:
-        """The next group whose nodes are all ready. Expired goals are dropped on the way."""
+        """The next group whose nodes are all ready. Expired goals, and those nobody waits for, are dropped on the way."""
         self.expire(now)
         for first in self._tickets.values():
             members = self._mates(first, ready)
@@ -74,9 +80,10 @@ class Coalescer:
         return None
 
     def expire(self, now: float) -> None:
-        late = [ticket for ticket in self._tickets.values() if ticket.expires <= now]
-        for ticket in late:
+        for ticket in [ticket for ticket in self._tickets.values() if ticket.expires <= now or ticket.gone()]:
             del self._tickets[ticket.servo]
+            if ticket.gone():
+                continue
             ticket.done(
                 GoalExpired(
                     "its time to live passed before its first byte could leave: the line or the servo is busy or gone",
@@ -86,11 +93,6 @@ class Coalescer:
 
     def next_expiry(self) -> float | None:
         return min((ticket.expires for ticket in self._tickets.values()), default=None)
-
-    def discard(self, ticket: Ticket) -> None:
-        """Its caller went away; nobody is told."""
-        if self._tickets.get(ticket.servo) is ticket:
-            del self._tickets[ticket.servo]
 
     def drop(self, error: Callable[[str], ServobusError], nodes: Collection[int] | None = None) -> None:
         """End all goals, or those of some nodes, with an error."""

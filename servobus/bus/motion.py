@@ -67,8 +67,7 @@ class Motion:
         for servo, goal in goals.items():
             future: asyncio.Future[Outcome] = bus.loop.create_future()
             ticket = self._ticket(bus.records[servo], goal, future)
-            ticket.batch, ticket.confirm = batch, confirm
-            future.add_done_callback(partial(self._forget, ticket))
+            ticket.batch, ticket.confirm, ticket.gone = batch, confirm, future.cancelled
             bus.stats.counts["goals"] += 1
             bus.scheduler.coalescer.put(ticket)
             futures[servo] = future
@@ -100,10 +99,6 @@ class Motion:
         if not future.done():
             error = copy(result)  # one error may end the tickets of several servos
             future.set_exception(error.at(bus=self._bus.name, servo=record.name) if isinstance(error, ServobusError) else error)
-
-    def _forget(self, ticket: Ticket, future: asyncio.Future[Outcome]) -> None:
-        if future.cancelled():
-            self._bus.scheduler.coalescer.discard(ticket)
 
     async def enable(self, servo: str) -> None:
         self.refuse()

@@ -1,0 +1,133 @@
+"""What moves on one bus, where the rig's tests cannot reach: callers that leave, servos that fail while they are enabled or parked."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from servobus.errors import DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
+from servobus.protocols.base import Goal, Outcome
+from servobus.protocols.sms.codec import Instruction, encode
+from tests.bus.puppet import Answers, puppet_bus
+from tests.virtual import virtual
+
+PARKED = "s1: {id: 1, model: sts, on_estop: park, park_pose: 10, park_timeout: 0.5}"
+
+
+@virtual
+async def test_a_caller_who_leaves_takes_its_goal_along() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        bus.records["s1"].enabled = True
+        futures = bus.motion.put(bus.motion.check({"s1": Goal("position", 5)}), together=False, confirm=False)
+        futures["s1"].cancel()
+        await asyncio.sleep(0.1)
+        assert puppet.heard == []
+        assert len(bus.scheduler.coalescer) == 0
+
+
+@virtual
+async def test_enable_asks_who_it_is_first_if_that_is_not_known() -> None:
+    async with puppet_bus(started=False) as (bus, puppet, _, _):
+        memory: dict[int, bytes] = {}
+
+        def script(frame: bytes) -> Answers | None:
+            """A servo that keeps what is written."""
+            if frame[4] == Instruction.WRITE:
+                memory[frame[5]] = frame[6:-1]
+            elif frame[4] == Instruction.READ and frame[5] in memory:
+                return [(0.001, encode(frame[2], 0, memory[frame[5]][: frame[6]]))]
+            return None
+
+        puppet.script = script
+        await bus.motion.enable("s1")
+        assert bus.records["s1"].enabled
+        identity = bus.records["s1"].identity
+        assert identity is not None
+        assert puppet.heard[1][4:6] == bytes((Instruction.READ, 0)), "behind the fence comes the question who it is"
+
+
+@virtual
+async def test_a_servo_that_does_not_take_its_goal_stays_disabled() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        with pytest.raises(DeviceError, match="arm/s1"):
+            await bus.motion.enable("s1")  # a puppet's torque reads 0 whatever is written
+        assert not bus.records["s1"].enabled
+
+
+@virtual
+async def test_disable_that_does_not_read_back_is_an_error_and_it_is_disabled_for_us() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        bus.records["s1"].enabled = True
+        torque = encode(1, Instruction.READ, bytes((40, 1)))
+        puppet.script = lambda frame: [(0.001, encode(1, 0, b"\x01"))] if frame == torque else None
+        with pytest.raises(DeviceError, match="not confirmed"):
+            await bus.motion.disable("s1")
+        assert not bus.records["s1"].enabled
+
+
+@virtual
+async def test_disable_ends_a_goal_that_waits() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        bus.records["s1"].enabled = True
+        puppet.script = lambda frame: [] if frame[2] == 1 else None
+        with pytest.raises(ReplyTimeout):
+            await bus.read_register("s1", "id")
+        future = bus.motion.put({"s1": Goal("position", 5)}, together=False, confirm=False)["s1"]
+        with pytest.raises(ReplyTimeout):
+            await bus.motion.disable("s1")
+        with pytest.raises(NotEnabled, match="arm/s1"):
+            await future
+
+
+@virtual
+async def test_a_goal_on_a_line_that_is_down_fails_at_once() -> None:
+    async with puppet_bus() as (bus, _, link, _):
+        bus.records["s1"].enabled = True
+        link.unplug()
+        await asyncio.sleep(0)
+        with pytest.raises(LinkDown, match="arm/s1"):
+            await bus.motion.put({"s1": Goal("position", 5)}, together=False, confirm=False)["s1"]
+
+
+@virtual
+async def test_the_e_stop_ends_an_enable_under_way() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        enabling = asyncio.create_task(bus.motion.enable("s1"))
+        await asyncio.sleep(0.0025)
+        await bus.motion.stop()
+        with pytest.raises(EStopped):
+            await enabling
+        assert not bus.records["s1"].enabled
+        assert not any(frame[4] == Instruction.WRITE and frame[5] == 40 and frame[6] == 1 for frame in puppet.heard)
+
+
+@virtual
+async def test_a_servo_that_does_not_reach_its_park_pose_goes_limp_all_the_same() -> None:
+    async with puppet_bus(PARKED) as (bus, puppet, _, _):
+        bus.records["s1"].enabled = True
+        report = await bus.motion.park("s1")
+        assert (report.action, report.written, report.confirmed) == ("park", True, False)
+        assert "park pose" in report.detail
+        assert not bus.records["s1"].enabled
+        assert any(frame[4] == Instruction.SYNC_WRITE and frame[5] == 40 for frame in puppet.heard)
+
+
+@virtual
+async def test_a_bus_without_servos_stops_too() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        bus.records.clear()
+        assert await bus.motion.stop() == {}
+        assert puppet.heard == []
+
+
+@virtual
+async def test_one_outcome_for_each_goal_of_a_frame() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        for record in bus.records.values():
+            record.enabled = True
+        goals = bus.motion.check({"s1": Goal("position", 5), "s2": Goal("position", -5)})
+        futures = bus.motion.put(goals, together=True, confirm=False)
+        assert await asyncio.gather(*futures.values()) == [Outcome.SENT, Outcome.SENT]
+        assert len(puppet.heard) == 1
+        assert bus.records["s1"].setpoint == 5
