@@ -43,7 +43,7 @@ VERBS: dict[str, Verb] = {
     "read_span": (lambda rig: rig.read_register("s3", "5:1"), lambda value: value == [3]),
     "write_register": (lambda rig: rig.write_register("s2", "torque_limit", 50), lambda value: value == 50),
     "persist": (lambda rig: rig.write_register("s3", "return_delay", 100, raw=True, persist=True), lambda value: value == 100),
-    "scan": (lambda rig: rig.scan("arm", ids=range(5)), lambda found: [hit.id for hit in found] == [1, 2, 3]),  # type: ignore[attr-defined]
+    "scan": (lambda rig: rig.scan("arm", ids=range(5)), lambda found: {hit.id for hit in found} <= {1, 2, 3}),  # type: ignore[attr-defined]
     "enable": (lambda rig: rig.enable(), lambda done: done is None),
     "write": (lambda rig: rig["s1"].move_to(10), lambda outcome: outcome is Outcome.ACKED),
     "sync_write": (
@@ -75,6 +75,7 @@ async def _every_verb(rig: LocalRig, delivery: Delivery) -> None:
                 ended[name] = False
             else:
                 assert right(result), f"{name}: {result!r}"
+                assert delivery.lossy or name != "scan" or len(result) == 3, f"{result!r}"  # type: ignore[arg-type]
                 ended[name] = True
     assert ended["stop"]
     assert sum(ended.values()) > len(ended) / 2, ended
