@@ -107,6 +107,9 @@ class Line:
         return start
 
     def answered(self, now: float, quiet_after: float) -> None:
-        """The silence that must follow an answer."""
+        """The answer is here, so all that was said has left, however soon that was (a PTY has no wire). Then the silence that must
+        follow."""
+        if self.sent_by > now:
+            self.sent_by = self._last_start = now
         if quiet_after:
             self._quiet_at = now + quiet_after

@@ -106,7 +106,7 @@ class Motion:
         if record.identity is None:
             await self._bus.identify(servo)
         self._set_enabled(record, False)
-        present = await self._bus.at(servo, self._bus.perform(self._bus.driver.enable(servo), record.node.id, motion=True))
+        present = await self._bus.perform(self._bus.driver.enable(servo), record.node.id, servo=servo, motion=True)
         if self.latched:
             raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
         record.setpoint = present
@@ -116,7 +116,7 @@ class Motion:
         record = self._bus.records[servo]
         self._bus.scheduler.coalescer.drop(self._disabled, {record.node.id})
         self._set_enabled(record, False)
-        report = await self._bus.at(servo, self._bus.perform(self._bus.driver.disable(servo), record.node.id, urgent=True))
+        report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
         if not report.confirmed:
             raise DeviceError(f"torque off was written and not confirmed: {report.detail}", bus=self._bus.name, servo=servo)
 

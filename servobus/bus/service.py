@@ -7,30 +7,21 @@ start, a restarted servo is disabled and its goal is not sent again.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from servobus.bus.health import Condition, Health, Node
 from servobus.bus.line import EchoFilter, Line
 from servobus.bus.master import BusMaster
 from servobus.bus.motion import Motion
-from servobus.bus.queue import Callback, Job
+from servobus.bus.queue import TRIES, Callback, Job
 from servobus.bus.record import ServoRecord
 from servobus.bus.runner import Runner
 from servobus.bus.scheduler import Scheduler
 from servobus.bus.stats import BusStats
 from servobus.errors import LeaseHeld, LinkDown, NotSupported, ReplyTimeout, ServobusError
-from servobus.protocols.base import (
-    Codec,
-    Driver,
-    Identity,
-    LineTraits,
-    Plan,
-    Request,
-    State,
-    Update,
-)
+from servobus.protocols.base import Codec, Driver, Identity, LineTraits, Plan, Request, State, Update
 from servobus.protocols.options import BusOptions
 from servobus.timerfd import clock_of
 
@@ -104,25 +95,52 @@ class BusService:
 
     # Requests and plans
 
-    async def ask(self, request: Request[R], *, urgent: bool = False, session: object = None, tries: int = 3) -> R:
-        """One request's value. Raises ReplyTimeout, DeviceError, LinkDown, Overloaded."""
-        future: asyncio.Future[R] = self.loop.create_future()
-        job = Job(future, self.clock() + PATIENCE, request=request, urgent=urgent, session=session, tries=tries)
-        return await self._await(job, future)
+    def ask(
+        self, request: Request[R], *, servo: str | None = None, urgent: bool = False, session: object = None, tries: int = TRIES
+    ) -> Coroutine[Any, Any, R]:
+        """One request's value. Raises ReplyTimeout, DeviceError, LinkDown, Overloaded; `servo` is the place they name."""
+        job = Job(
+            self.loop.create_future(),
+            self.clock() + PATIENCE,
+            request=request,
+            urgent=urgent,
+            session=session,
+            tries=tries,
+        )
+        return self._result(job, servo)
 
-    async def perform(self, plan: Plan[R], node: int, *, motion: bool = False, urgent: bool = False, session: object = None) -> R:
-        """A plan's result; nothing but an e-stop comes between its frames."""
-        future: asyncio.Future[R] = self.loop.create_future()
-        job = Job(future, self.clock() + PATIENCE, plan=plan, node=node, motion=motion, urgent=urgent, session=session)
-        return await self._await(job, future)
+    def perform(
+        self,
+        plan: Plan[R],
+        node: int,
+        *,
+        servo: str | None = None,
+        motion: bool = False,
+        urgent: bool = False,
+        session: object = None,
+    ) -> Coroutine[Any, Any, R]:
+        """A plan's result; nothing but an e-stop comes between its frames. Raises as `ask`."""
+        job = Job(
+            self.loop.create_future(),
+            self.clock() + PATIENCE,
+            plan=plan,
+            node=node,
+            motion=motion,
+            urgent=urgent,
+            session=session,
+        )
+        return self._result(job, servo)
 
-    async def _await(self, job: Job, future: asyncio.Future[R]) -> R:
+    async def _result(self, job: Job, servo: str | None) -> Any:
         try:
             self.master.submit(job)
         except ServobusError as error:
             job.fail(error)
             await asyncio.sleep(DOWN_PAUSE)
-        return await future
+        try:
+            return await cast("asyncio.Future[Any]", job.sink)
+        except ServobusError as error:
+            raise error.at(bus=self.name, servo=servo) from None
 
     def set_baudrate(self, baudrate: int) -> None:
         """For an exclusive session."""
@@ -134,7 +152,7 @@ class BusService:
     async def read(self, servo: str, max_age: float | None = None) -> State:
         record = self.records[servo]
         if max_age is None or record.updated_at is None or self.clock() - record.updated_at > max_age:
-            self._updated(await self.at(servo, self.ask(self.driver.read_state(servo))))
+            self._updated(await self.ask(self.driver.read_state(servo), servo=servo))
         return self.state(servo)
 
     def state(self, servo: str) -> State:
@@ -158,20 +176,20 @@ class BusService:
         }
         return {"up": self.master.up, "waiting": self.scheduler.waiting(), **self.stats.snapshot(self.clock()), "nodes": nodes}
 
-    async def read_register(self, servo: str, register: str, *, raw: bool = False) -> Any:
-        return await self.at(servo, self.ask(self.driver.read_register(servo, register, raw=raw)))
+    def read_register(self, servo: str, register: str, *, raw: bool = False) -> Coroutine[Any, Any, Any]:
+        return self.ask(self.driver.read_register(servo, register, raw=raw), servo=servo)
 
     async def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
         if persist and self.records[servo].enabled:
             raise NotSupported("EEPROM is written to disabled servos only: disable it first", bus=self.name, servo=servo)
         plan = self.driver.write_register(servo, register, value, raw=raw, persist=persist)
-        return await self.at(servo, self.perform(plan, self.driver.nodes[servo]))
+        return await self.perform(plan, self.driver.nodes[servo], servo=servo)
 
-    async def ping(self, servo: str) -> int | None:
-        return await self.at(servo, self.ask(self.driver.ping(self.driver.nodes[servo]), urgent=True))
+    def ping(self, servo: str) -> Coroutine[Any, Any, int | None]:
+        return self.ask(self.driver.ping(self.driver.nodes[servo]), servo=servo, urgent=True)
 
     async def identify(self, servo: str) -> Identity:
-        identity = await self.at(servo, self.perform(self.driver.identify(servo), self.driver.nodes[servo], urgent=True))
+        identity = await self.perform(self.driver.identify(servo), self.driver.nodes[servo], servo=servo, urgent=True)
         self._introduced(self.records[servo], identity)
         return identity
 
@@ -238,10 +256,3 @@ class BusService:
     def on(self, node: Node) -> list[ServoRecord]:
         """The servos of a node."""
         return [record for record in self.records.values() if record.node is node]
-
-    async def at(self, servo: str, awaitable: Awaitable[R]) -> R:
-        """Give an error from below its place."""
-        try:
-            return await awaitable
-        except ServobusError as error:
-            raise error.at(bus=self.name, servo=servo) from None

@@ -46,6 +46,8 @@ class SmsDriver:
         self.servos = {name: FittedServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.by_node = {servo.node: servo for servo in self.servos.values()}
         self.nodes = {name: servo.node for name, servo in self.servos.items()}
+        self._reads: dict[tuple[str, str, bool], Request[Any]] = {}
+        """Requests are immutable, and the same few registers are read again and again."""
         self._writer = GoalWriter(options)
         self._stopper = Stopper(options)
 
@@ -134,13 +136,21 @@ class SmsDriver:
         return SyncRead(address, size, list(here), decode)
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
+        known = self._reads.get((servo, register, raw))
+        if known is not None:
+            return known
         fitted = self.servos[servo]
         if match := SPAN.fullmatch(register):
             return self._read_span(fitted, int(match[1], 0), int(match[2]))
-        found = fitted.model.readable(register)
+        request = self._reads[servo, register, raw] = self._read_named(fitted, fitted.model.readable(register), raw)
+        return request
+
+    def _read_named(self, servo: FittedServo, register: Register, raw: bool) -> Request[Any]:
         if raw:
-            return self._read(fitted, found)
-        return Read(fitted.node, found.address, found.size, lambda data: fitted.to_physical(found, fitted.decode(found, data)))
+            return self._read(servo, register)
+        return Read(
+            servo.node, register.address, register.size, lambda data: servo.to_physical(register, servo.decode(register, data))
+        )
 
     @staticmethod
     def _read_span(servo: FittedServo, address: int, size: int) -> Read[list[int]]:
