@@ -181,6 +181,8 @@ class Health:
 
     def due_probe(self, now: float) -> Node | None:
         """The configured node that has waited longest to be looked for."""
+        if not self._troubled:
+            return None
         due = [node for node in self._troubled.values() if node.next_probe <= now]
         return min(due, key=lambda node: node.next_probe, default=None)
 

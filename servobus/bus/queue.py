@@ -125,7 +125,8 @@ class RequestQueue:
 
     def take(self, now: float, session: object = None) -> Job | None:
         """The next job; only those of `session`, when one is given. Jobs nobody awaits are dropped, those too old fail."""
-        for node in list(self._lines):
+        for _ in range(len(self._lines)):
+            node = next(iter(self._lines))
             line = self._lines.pop(node)
             job = self._first_wanted(line, now, session)
             if line:

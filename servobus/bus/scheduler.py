@@ -74,6 +74,7 @@ class Scheduler:
         self._poll_due = math.inf
         self._parked: list[Job] = []
         self._lanes = (self._next_goal, self._next_request, self._next_poll, self._next_probe)
+        self._upwards = list(enumerate(self._lanes))[::-1]
         self._owed = [False] * len(self._lanes)
 
     # What waits
@@ -116,21 +117,21 @@ class Scheduler:
             return self.estop.popleft()
         if self.session is not None:
             return self.requests.take(now, self.session)
-        return self._pick(0, now)
+        for lane, take in enumerate(self._lanes):
+            if not self._owed[lane] and (job := take(now)) is not None:
+                return self._served(lane, job)
+        # Nobody waits to whom a turn is owed, so the others may go on; the lowest of them first, for it is owed one by those above.
+        for lane, take in self._upwards:
+            if self._owed[lane] and (job := take(now)) is not None:
+                return self._served(lane, job)
+        return None
 
-    def _pick(self, lane: int, now: float) -> Job | None:
-        if lane == len(self._lanes):
-            return None
-        if not self._owed[lane]:
-            job = self._lanes[lane](now)
-            if job is not None:
-                self._owed[lane] = True
-                return job
-        lower = self._pick(lane + 1, now)
-        if lower is not None:
-            self._owed[lane] = False
-            return lower
-        return self._lanes[lane](now) if self._owed[lane] else None
+    def _served(self, lane: int, job: Job) -> Job:
+        """Every class above has had its lower turn; this one owes one now."""
+        for above in range(lane):
+            self._owed[above] = False
+        self._owed[lane] = True
+        return job
 
     def wake(self) -> float | None:
         """The next moment at which something becomes due or too old, if nothing else happens."""
@@ -145,6 +146,8 @@ class Scheduler:
         """End what is too old. Called when nothing can be sent, or nothing is due."""
         self.requests.expire(now)
         self.coalescer.expire(now)
+        if not self._parked:
+            return
         late = [job for job in self._parked if job.expires <= now or job.sink.done()]
         if late:
             self._parked = [job for job in self._parked if job not in late]

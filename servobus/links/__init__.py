@@ -13,7 +13,7 @@ from servobus.links.tcp import TcpLink
 
 def _tcp(parts: SplitResult, baudrate: int) -> Link:
     host, port = parts.hostname, parts.port  # port raises ValueError for what is no port
-    if not host or not port or parts.path or parts.query:
+    if not host or not port or parts.path or parts.query or parts.fragment or parts.username is not None:
         raise ValueError
     return TcpLink(host, port, baudrate)
 
@@ -26,17 +26,17 @@ SCHEMES: dict[str, tuple[Callable[[SplitResult, int], Link], str]] = {
 
 def open_link(port: str, baudrate: int, *, rs485: bool = False) -> Link:
     """The link of a config's `port`: a device path, or one of the schemes. Opens nothing. Raises ConfigError."""
-    scheme, separator, _ = port.partition("://")
-    if not separator:
-        return SerialLink(port, baudrate, rs485=rs485)
-    if scheme not in SCHEMES:
+    scheme, separator, rest = port.partition(":")
+    if scheme in SCHEMES:
+        build, form = SCHEMES[scheme]
+        try:
+            return build(urlsplit(port), baudrate)
+        except ValueError:
+            raise ConfigError(f"port {port!r} cannot be read: write {form}") from None
+    if separator and rest.startswith("//"):
         known = ", ".join(form for _, form in SCHEMES.values())
         raise ConfigError(f"port {port!r}: {scheme}:// is not known; write a device path, {known} or sim:")
-    build, form = SCHEMES[scheme]
-    try:
-        return build(urlsplit(port), baudrate)
-    except ValueError:
-        raise ConfigError(f"port {port!r}: write {form}") from None
+    return SerialLink(port, baudrate, rs485=rs485)
 
 
 def check_port(port: str) -> None:

@@ -1,7 +1,7 @@
 """A line that goes wrong as real ones do: it stands before another far end and damages what that says to the master.
 
-Every fault has a share of the replies it strikes (`FaultOptions`), from a seeded source, so a run can be had again. A node and its
-UART are a queue: behind a reply that is late, the later ones of the same node wait.
+Every fault has a share of the replies it strikes (`FaultOptions`), from a seeded source, so a run can be had again. A node and
+its UART are a queue: behind a reply that is late, the later ones of the same node wait.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class FaultyEnd:
         self._rng = random.Random(options.seed)
         self._node_of = node_of
         self._damages = {"wrong_id": rename, **DAMAGES}
-        self._deliver: Callable[[bytes], None] = bytes
+        self._deliver: Callable[[bytes], None] = _nobody
         self._late_until: dict[Hashable, float] = {}
         self._pieces: deque[bytes] = deque()
         far.attach(self._heard)
@@ -127,3 +127,7 @@ class FaultyEnd:
             size = 1 if self._options.chop == "bytes" else self._rng.randint(1, LONGEST_PIECE)
             yield data[:size]
             data = data[size:]
+
+
+def _nobody(data: bytes) -> None:
+    """Where nothing is attached, nothing is heard."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from serial.tools import list_ports as serial_ports
+
+from servobus.links.device import find_holder
 
 LINK_FOLDERS = (Path("/dev/serial/by-id"), Path("/dev/serial/by-path"))
 """Where udev puts names that stay the same whatever is plugged in first."""
@@ -48,42 +49,6 @@ def list_ports() -> list[PortInfo]:
         )
         for port in sorted(serial_ports.comports())
     ]
-
-
-def find_holder(path: str) -> tuple[int, str] | None:
-    """Another process that has this device open, and its name, as far as this user may see."""
-    try:
-        wanted = os.stat(path)
-    except OSError:
-        return None
-    own = os.getpid()
-    for process in Path("/proc").glob("[0-9]*"):
-        pid = int(process.name)
-        if pid != own and any(_same(wanted, found) for found in _open_files(process)):
-            return pid, _name(process)
-    return None
-
-
-def _open_files(process: Path) -> Iterator[os.stat_result]:
-    try:
-        for descriptor in (process / "fd").iterdir():
-            try:
-                yield descriptor.stat()
-            except OSError:
-                continue  # closed meanwhile
-    except OSError:
-        return  # ended meanwhile, or another user's
-
-
-def _same(one: os.stat_result, other: os.stat_result) -> bool:
-    return one.st_rdev == other.st_rdev and one.st_ino == other.st_ino and one.st_dev == other.st_dev
-
-
-def _name(process: Path) -> str:
-    try:
-        return (process / "comm").read_text().strip()
-    except OSError:
-        return "unknown"
 
 
 def _links(folder: Path) -> dict[str, str]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 import socket
+from functools import partial
 
 from servobus.errors import LinkDown
 from servobus.protocols.base import LineTraits
@@ -11,15 +14,28 @@ from servobus.protocols.base import LineTraits
 CONNECT_TIMEOUT = 2.0
 LATENCY = 0.020
 """Seconds a server may collect bytes before it sends them on."""
-KEEPALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
-"""A peer that is gone without a word is noticed within 8 s, even if nothing is asked of it."""
+MOST_UNSENT = 64 * 1024
+"""Bytes that may wait for the server; one that takes none for so long is gone."""
+OPTIONS = (
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+    (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
+)
+"""No byte waits for another, and a server that is gone without a word is noticed within 8 s, even if nothing is asked of it."""
+REASONS = {
+    errno.ECONNREFUSED: "nobody listens there: check the port number, and whether the server is on",
+    errno.EHOSTUNREACH: "no way leads there: check the address and the cable",
+    errno.ENETUNREACH: "no way leads there: check the address and this machine's network",
+}
 
 
 class TcpLink:
-    """See `links.base.Link`. `baudrate`: what the server speaks on its line, for deadlines; it is set there."""
+    """See `links.base.Link`. `baudrate`: what the server speaks on its line, for deadlines; it is set at the server."""
 
     def __init__(self, host: str, port: int, baudrate: int) -> None:
-        self.address = f"tcp://{host}:{port}"
+        self.address = f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
         self.traits = LineTraits(baudrate, latency=LATENCY)
         self._host = host
         self._port = port
@@ -29,40 +45,55 @@ class TcpLink:
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
-                _, adapter = await loop.create_connection(lambda: TcpTransport(protocol, self.address), self._host, self._port)
-        except TimeoutError:
-            raise LinkDown(f"{self.address} does not answer: is the server on, is the address right?") from None
+                _, adapter = await loop.create_connection(partial(TcpTransport, protocol, self.address), self._host, self._port)
         except OSError as error:
-            raise LinkDown(f"{self.address} cannot be reached ({error.strerror or error}): check host, port and server") from None
+            raise explain(self.address, error) from None
         return adapter
 
 
+def explain(address: str, error: OSError) -> LinkDown:
+    """What the system's error means, and what to do about it."""
+    if isinstance(error, TimeoutError):
+        return LinkDown(f"{address} does not answer: check the address, and whether the server is on")
+    if isinstance(error, socket.gaierror):
+        return LinkDown(f"{address}: this machine knows no such host ({error.strerror}): check the name, or write the address")
+    if error.errno in REASONS:
+        return LinkDown(f"{address}: {REASONS[error.errno]}")
+    reason = os.strerror(error.errno) if error.errno else error
+    return LinkDown(f"{address} cannot be reached ({reason}): check host, port and server")
+
+
 class TcpTransport(asyncio.Protocol):
-    """See `links.base.Transport`: the socket's transport, with the one method it lacks and errors in our words."""
+    """See `links.base.Transport`: the socket's transport with the methods it lacks, and its errors in our words."""
 
     def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
         self._protocol = protocol
         self._address = address
-        self._closed_by_us = False
+        self._error: LinkDown | None = LinkDown(f"{address} closed the connection: it is opened again")
+        """What to say when the connection ends."""
         self._socket: asyncio.Transport
+        # No detour for what is heard. Here and not later: uvloop looks it up before it reports the connection.
+        self.data_received = protocol.data_received  # type: ignore[method-assign]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._socket = transport
-        sock = transport.get_extra_info("socket")
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in KEEPALIVE.items():
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-        self._protocol.connection_made(self)  # type: ignore[arg-type]
-        self.data_received = self._protocol.data_received  # type: ignore[method-assign]
+        for level, option, value in OPTIONS:
+            transport.get_extra_info("socket").setsockopt(level, option, value)
+        self._protocol.connection_made(self)  # type: ignore[arg-type]  # a Transport by its methods, not by its base
 
     def connection_lost(self, exc: Exception | None) -> None:
-        error = None if self._closed_by_us else LinkDown(f"{self._address} closed the connection ({exc or 'end of file'}): it is opened again")
-        self._protocol.connection_lost(error)
+        if self._error is not None and exc is not None:
+            self._error = LinkDown(f"{self._address} was lost ({exc}): it is opened again")
+        self._protocol.connection_lost(self._error)
 
     def write(self, data: bytes) -> None:
+        if self._socket.is_closing():
+            return
         self._socket.write(data)
+        if self._socket.get_write_buffer_size() > MOST_UNSENT:
+            self._error = LinkDown(f"{self._address} takes no more bytes: is the server alive?")
+            self._socket.abort()
 
     def look(self) -> bool:
         """The loop reads the socket."""
@@ -75,9 +106,9 @@ class TcpTransport(asyncio.Protocol):
         return self._socket.is_closing()
 
     def close(self) -> None:
-        self._closed_by_us = True
+        self._error = None
         self._socket.close()
 
     def abort(self) -> None:
-        self._closed_by_us = True
+        self._error = None
         self._socket.abort()

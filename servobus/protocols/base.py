@@ -29,11 +29,6 @@ class LineTraits:
     """What adapter, driver or tunnel add to every reply."""
     gap: float = 0.0
     """Silence before each frame."""
-    window: int = 1
-    """Turns in flight: more than one only on a full-duplex line."""
-    read_limit: int | None = None
-    """Registers one read may ask for, where the line limits that."""
-    write_limit: int | None = None
     can_change_baud: bool = False
 
     @property

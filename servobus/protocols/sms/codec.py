@@ -98,6 +98,8 @@ class SmsCodec:
     def next_reply(self) -> Packet | None:
         """The next packet with a right checksum; what cannot begin one is skipped and counted."""
         buffer = self._buffer
+        if not buffer:
+            return None
         start = 0
         while True:
             found = buffer.find(HEADER, start)
