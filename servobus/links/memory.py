@@ -22,9 +22,10 @@ class MemoryLink:
 
     async def connect(self, protocol: asyncio.Protocol) -> MemoryTransport:
         """Raises PortMissing while unplugged, PortBusy while open."""
+        await asyncio.sleep(0)  # whoever had it open before has been told by then that it is lost
         if not self._plugged:
             raise PortMissing(f"{self.address} is unplugged: plug it in")
-        if self._open is not None and not self._open.gone:
+        if self._open is not None and not self._open.is_closing():
             raise PortBusy(f"{self.address} is open already: close it first")
         self._open = MemoryTransport(protocol, self._far, asyncio.get_running_loop())
         protocol.connection_made(self._open)
@@ -54,8 +55,6 @@ class MemoryTransport(asyncio.Transport):
         self._far = far
         self._loop = loop
         self._closing = False
-        self.gone = False
-        """Its protocol was told that it is lost."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         if not self._closing:
@@ -85,8 +84,4 @@ class MemoryTransport(asyncio.Transport):
         """Tell the protocol once, and not from within its own call."""
         if not self._closing:
             self._closing = True
-            self._loop.call_soon(self._tell, error)
-
-    def _tell(self, error: LinkDown | None) -> None:
-        self.gone = True
-        self._protocol.connection_lost(error)
+            self._loop.call_soon(self._protocol.connection_lost, error)
