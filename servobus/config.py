@@ -1,24 +1,179 @@
+"""YAML bus configs: read within limits, checked whole, every mistake named by file, line and column.
+
+What a key means stands in `protocols/options.py` and beside each protocol; what only a whole file shows stands here: two buses on
+one port, two servos with one id, limits that a model cannot reach.
+"""
+
 from __future__ import annotations
+
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from servobus import yamlfile
-from servobus.protocols.model import ServoModel
-from servobus.protocols.options import BusOptions
-from servobus.protocols.table import PROTOCOLS
+from typing import Annotated, Any, Union
 
-@dataclass(frozen=True)
+from pydantic import Field, TypeAdapter
+
+from servobus import yamlfile
+from servobus.complaints import Complaints, show
+from servobus.errors import ConfigError, ServobusError
+from servobus.links import check_port
+from servobus.protocols.model import ServoModel
+from servobus.protocols.options import BusOptions, Name, ServoOptions
+from servobus.protocols.table import PROTOCOLS
+from servobus.sim.build import SIMULATED, has_wire_time
+from servobus.yamlfile import KeyPath
+
+VERSION = 1
+KEYS = ("version", "buses")
+_name = TypeAdapter(Name)
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
+    """A whole rig."""
+
     version: int
     buses: Mapping[str, BusOptions]
     models: Mapping[str, Mapping[str, ServoModel]]
-    path: Path | None = None
+    """Bus -> model name -> model."""
 
-def parse_config(text: str, name: str, folder: Path = Path()) -> Config:
-    data = yamlfile.parse(text, name).data
-    buses = {n: PROTOCOLS[b["protocol"]].options.model_validate(b) for n, b in data["buses"].items()}
-    return Config(1, buses, {n: PROTOCOLS[o.protocol].models(o, folder) for n, o in buses.items()})
 
 def load_config(path: str | Path) -> Config:
-    return parse_config(Path(path).read_text(), str(path), Path(path).parent)
+    """The config in a file; model files are looked for beside it. Raises ConfigError."""
+    return _config(yamlfile.read(path), Path(path).parent)
+
+
+def parse_config(text: str | bytes, name: str, folder: Path = Path()) -> Config:
+    """The config in a text; `name` stands in messages. Raises ConfigError."""
+    return _config(yamlfile.parse(text, name), folder)
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON Schema, for editors."""
+    options = tuple(entry.options for entry in PROTOCOLS.values())
+    bus: Any = Annotated[Union[options], Field(discriminator="protocol")] if len(options) > 1 else options[0]  # noqa: UP007
+    schema = TypeAdapter(dict[Name, bus]).json_schema(ref_template="#/$defs/{model}")
+    definitions = schema.pop("$defs", {})
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "servobus config",
+        "type": "object",
+        "properties": {"version": {"const": VERSION}, "buses": {**schema, "minProperties": 1}},
+        "required": list(KEYS),
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+
+
+def _config(document: yamlfile.Document, folder: Path) -> Config:
+    complaints = Complaints(document)
+    buses: dict[str, BusOptions] = {}
+    models: dict[str, Mapping[str, ServoModel]] = {}
+    for name, data in _bus_entries(document.data, complaints):
+        options = _bus(name, data, complaints)
+        if options is not None:
+            buses[name] = options
+            models[name] = _models(("buses", name), options, folder, complaints)
+    _check_ports(buses, complaints)
+    complaints.raise_any()
+    return Config(VERSION, buses, models)
+
+
+def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str, Any]]:
+    if not isinstance(data, dict):
+        complaints.add((), f"found {show(data)}; a config begins with `version: 1` and has `buses:`")
+        return []
+    for key in data:
+        if key not in KEYS:
+            complaints.add((key,), f"unknown key; there are {', '.join(KEYS)}", key=True)
+    if data.get("version") != VERSION or isinstance(data.get("version"), bool):
+        where: KeyPath = ("version",) if "version" in data else ()
+        complaints.add(where, f"found version {show(data.get('version'))}; write `version: {VERSION}`")
+    buses = data.get("buses")
+    if not isinstance(buses, dict) or not buses:
+        complaints.add(("buses",) if "buses" in data else (), "no buses; name at least one under `buses:`")
+        return []
+    return list(buses.items())
+
+
+def _bus(name: str, data: Any, complaints: Complaints) -> BusOptions | None:
+    path: KeyPath = ("buses", name)
+    try:
+        _name.validate_python(name)
+    except ValueError:
+        complaints.add(path, "a name is letters, digits, . _ - and begins with a letter or digit", key=True)
+        return None
+    if not isinstance(data, dict):
+        complaints.add(path, f"found {show(data)}; a bus has the keys protocol, port, baudrate, servos")
+        return None
+    protocol = data.get("protocol")
+    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+        where = (*path, "protocol") if "protocol" in data else path
+        complaints.add(where, f"found protocol {show(protocol)}; there are {', '.join(PROTOCOLS)}")
+        return None
+    options: BusOptions | None = complaints.validated(PROTOCOLS[protocol].options, data, path)
+    return options
+
+
+def _models(path: KeyPath, options: BusOptions, folder: Path, complaints: Complaints) -> Mapping[str, ServoModel]:
+    """The models of a bus, and what its servos want that those cannot do."""
+    found: dict[str, ServoModel] = {}
+    places: dict[Any, str] = {}
+    for servo, entry in options.servos.items():
+        here = (*path, "servos", servo)
+        other = places.setdefault(entry.key, servo)
+        if other != servo:
+            complaints.add((*here, "id"), f"found id {entry.id} again (it is {other}'s); each servo has its own")
+        try:
+            one = options.model_copy(update={"servos": {servo: entry}})
+            found.update(PROTOCOLS[options.protocol].models(one, folder))
+        except ConfigError as error:
+            complaints.add((*here, "model"), str(error))
+        else:
+            _check_servo(here, entry, found[entry.model], complaints)
+    return found
+
+
+def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complaints: Complaints) -> None:
+    """What this model cannot do, or the wire cannot carry."""
+    if servo.unit is not None and servo.unit not in model.units:
+        complaints.add((*here, "unit"), f"found {show(servo.unit)}; model {model.name} has {', '.join(model.units)}")
+        return
+    calibration = servo.calibration(model)
+    reach = model.reach
+    if "position" in reach:
+        ends = sorted(calibration.to_unit(raw) for raw in reach["position"])
+        for key, values in (("limits", servo.limits or ()), ("park_pose", [servo.park_pose])):
+            for value in values:
+                if value is not None and not ends[0] <= value <= ends[1]:
+                    complaints.add((*here, key), f"found {value:g}; model {model.name} reaches {ends[0]:g} to {ends[1]:g}")
+    greatest = {
+        "speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
+        "max_speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
+        "acceleration": reach["acceleration"][1] * calibration.unit_per_step if "acceleration" in reach else None,
+        "torque_limit": reach["torque_limit"][1] if "torque_limit" in reach else None,
+    }
+    for key, most in greatest.items():
+        value = getattr(servo, key)
+        if value is not None and most is not None and value > most:
+            told = f"model {model.name} takes at most {most:g}" if most else f"model {model.name} has none"
+            complaints.add((*here, key), f"found {value:g}; {told}")
+
+
+def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> None:
+    """Each line has one owner, by whatever name it goes."""
+    owners: dict[str, str] = {}
+    for name, options in buses.items():
+        path: KeyPath = ("buses", name, "port")
+        try:
+            if options.port.startswith(SIMULATED):
+                has_wire_time(options.port)
+                continue
+            check_port(options.port)
+        except ServobusError as error:
+            complaints.add(path, error.message)
+            continue
+        owner = owners.setdefault(os.path.realpath(options.port), name)
+        if owner != name:
+            complaints.add(path, f"found the port of bus {owner} again; put its servos into one bus, a line has one owner")

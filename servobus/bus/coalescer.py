@@ -1,7 +1,9 @@
 """Keeps the latest goal of each servo and hands them out as groups. Pure: the time is given.
 
 A newer goal replaces the older one of the same servo wherever that one stood; a goal whose time to live has passed is
-dropped, never replayed. Goals that were asked for together leave together or not at all.
+dropped, never replayed. Goals that were asked for together leave together or not at all: when one of them is dropped
+(expired, disabled, its caller gone), the others are too. A newer goal for one of them drops nothing: that servo has
+what its caller wanted last, and the others still leave in one turn.
 """
 
 from __future__ import annotations
@@ -9,12 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
-from servobus.errors import GoalExpired, ServobusError
+from servobus.errors import ActionWithheld, GoalExpired, ServobusError
 from servobus.protocols.base import Outcome, ServoGoal
 
 
 def _never() -> bool:
     return False
+
+
+def _expired(servo: str) -> ServobusError:
+    return GoalExpired(
+        "its time to live passed before its first byte could leave: the line or the servo is busy or gone", servo=servo
+    )
 
 
 @dataclass(slots=True, eq=False)
@@ -80,26 +88,30 @@ class Coalescer:
         return None
 
     def expire(self, now: float) -> None:
-        for ticket in [ticket for ticket in self._tickets.values() if ticket.expires <= now or ticket.gone()]:
-            del self._tickets[ticket.servo]
-            if ticket.gone():
-                continue
-            ticket.done(
-                GoalExpired(
-                    "its time to live passed before its first byte could leave: the line or the servo is busy or gone",
-                    servo=ticket.servo,
-                )
-            )
+        """End what is too old (at the very moment it expires) or waited for by nobody, and its group with it."""
+        late = [ticket for ticket in self._tickets.values() if ticket.expires <= now or ticket.gone()]
+        if late:
+            self._end(late, _expired)
 
     def next_expiry(self) -> float | None:
         return min((ticket.expires for ticket in self._tickets.values()), default=None)
 
-    def drop(self, error: Callable[[str], ServobusError], nodes: Collection[int] | None = None) -> None:
-        """End all goals, or those of some nodes, with an error."""
-        dropped = [ticket for ticket in self._tickets.values() if nodes is None or ticket.node in nodes]
-        for ticket in dropped:
+    def drop(self, error: Callable[[str], ServobusError], servos: Collection[str] | None = None) -> None:
+        """End all goals, or those of some servos and of their groups, with an error."""
+        self._end([ticket for ticket in self._tickets.values() if servos is None or ticket.servo in servos], error)
+
+    def _end(self, ended: Sequence[Ticket], error: Callable[[str], ServobusError]) -> None:
+        """These end with the error; those asked for together with one of them are withheld."""
+        batches = {ticket.batch for ticket in ended if ticket.batch is not None}
+        mates = [ticket for ticket in self._tickets.values() if ticket.batch in batches and ticket not in ended]
+        for ticket in (*ended, *mates):
             del self._tickets[ticket.servo]
-            ticket.done(error(ticket.servo))
+        names = ", ".join(ticket.servo for ticket in ended)
+        for ticket in ended:
+            if not ticket.gone():
+                ticket.done(error(ticket.servo))
+        for ticket in mates:
+            ticket.done(ActionWithheld(f"it was asked for together with {names}, dropped meanwhile: nothing was sent", servo=ticket.servo))
 
     def _mates(self, first: Ticket, ready: Collection[int]) -> list[Ticket]:
         """All that can leave with this one; empty while it cannot leave."""

@@ -8,7 +8,7 @@ a growing list.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from servobus.errors import Overloaded, ReplyTimeout, ServobusError
@@ -124,7 +124,8 @@ class RequestQueue:
         self._length += 1
 
     def take(self, now: float, session: object = None) -> Job | None:
-        """The next job; only those of `session`, when one is given. Jobs nobody awaits are dropped, those too old fail."""
+        """The next job; only those of `session`, when one is given: those pass whatever else waits for their node. Jobs nobody
+        awaits are dropped, those too old fail."""
         for _ in range(len(self._lines)):
             node = next(iter(self._lines))
             line = self._lines.pop(node)
@@ -136,8 +137,12 @@ class RequestQueue:
         return None
 
     def _first_wanted(self, line: deque[Job], now: float, session: object) -> Job | None:
-        while line and (session is None or line[0].session is session):
-            job = line.popleft()
+        while line:
+            at = 0 if session is None else next((at for at, job in enumerate(line) if job.session is session), None)
+            if at is None:
+                return None
+            job = line[at]
+            del line[at]
             self._length -= 1
             if self._still_wanted(job, now):
                 return job
@@ -153,17 +158,18 @@ class RequestQueue:
     def next_expiry(self) -> float | None:
         return min((line[0].expires for line in self._lines.values() if line), default=None)
 
-    def remove(self, unwanted: Callable[[Job], bool]) -> Iterator[Job]:
-        """Take out all jobs that are unwanted."""
+    def remove(self, unwanted: Callable[[Job], bool]) -> list[Job]:
+        """Take out all jobs that are unwanted, in order for each node."""
+        removed = []
         for node, line in list(self._lines.items()):
             out = [job for job in line if unwanted(job)]
-            kept = deque(job for job in line if not unwanted(job))
-            self._length -= len(out)
-            if kept:
-                self._lines[node] = kept
-            else:
+            if len(out) == len(line):
                 del self._lines[node]
-            yield from out
+            elif out:
+                self._lines[node] = deque(job for job in line if job not in out)
+            removed += out
+        self._length -= len(removed)
+        return removed
 
     @staticmethod
     def _still_wanted(job: Job, now: float) -> bool:
@@ -171,13 +177,22 @@ class RequestQueue:
             job.fail(_abandoned())
             return False
         if job.expires <= now:
-            job.fail(ReplyTimeout("it waited too long for its turn: the line is busier than it can carry (`servobus check`)"))
+            job.fail(_too_late(job))
             return False
         return True
 
 
 def overloaded(waiting: int) -> Overloaded:
     return Overloaded(f"{waiting} requests wait already: ask for less, or later")
+
+
+def _too_late(job: Job) -> ReplyTimeout:
+    frame = job.request.frame if job.request is not None else b""
+    if job.attempts:
+        message = "no answer, and no time to ask again: what was asked may have been applied"
+    else:
+        message = "it waited too long for its turn: the line is busier than it can carry (`servobus check`)"
+    return ReplyTimeout(message, request=job.request, raw=frame)
 
 
 def _abandoned() -> ServobusError:

@@ -15,6 +15,7 @@ def _tcp(parts: SplitResult, baudrate: int) -> Link:
     host, port = parts.hostname, parts.port  # port raises ValueError for what is no port
     if not host or not port or parts.path or parts.query or parts.fragment or parts.username is not None:
         raise ValueError
+    host.encode("idna")  # raises UnicodeError, a ValueError, for what can be no name
     return TcpLink(host, port, baudrate)
 
 

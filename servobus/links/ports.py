@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from serial.tools import list_ports as serial_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from servobus.links.device import find_holder
 
@@ -34,25 +36,27 @@ class PortInfo:
 
 def list_ports() -> list[PortInfo]:
     """In the order of their device names."""
-    by_id, by_path = (_links(folder) for folder in LINK_FOLDERS)
-    return [
-        PortInfo(
-            device=port.device,
-            by_id=by_id.get(port.device),
-            by_path=by_path.get(port.device),
-            description=None if port.description == "n/a" else port.description,
-            manufacturer=port.manufacturer,
-            serial_number=port.serial_number,
-            vid=port.vid,
-            pid=port.pid,
-            holder=find_holder(port.device),
-        )
-        for port in sorted(serial_ports.comports())
-    ]
+    by_id, by_path = (links_in(folder) for folder in LINK_FOLDERS)
+    return [describe(port, by_id, by_path) for port in sorted(serial_ports.comports())]
 
 
-def _links(folder: Path) -> dict[str, str]:
-    """Device -> link that leads to it."""
+def describe(port: ListPortInfo, by_id: Mapping[str, str], by_path: Mapping[str, str]) -> PortInfo:
+    """What pyserial found, together with its other names and its holder."""
+    return PortInfo(
+        device=port.device,
+        by_id=by_id.get(port.device),
+        by_path=by_path.get(port.device),
+        description=None if port.description == "n/a" else port.description,
+        manufacturer=port.manufacturer,
+        serial_number=port.serial_number,
+        vid=port.vid,
+        pid=port.pid,
+        holder=find_holder(port.device),
+    )
+
+
+def links_in(folder: Path) -> dict[str, str]:
+    """Device -> link that leads to it; none where udev made no such folder."""
     try:
         return {os.path.realpath(link): str(link) for link in sorted(folder.iterdir())}
     except OSError:

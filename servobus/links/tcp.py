@@ -7,6 +7,7 @@ import errno
 import os
 import socket
 from functools import partial
+from typing import cast
 
 from servobus.errors import LinkDown
 from servobus.protocols.base import LineTraits
@@ -76,8 +77,7 @@ class TcpTransport(asyncio.Protocol):
         self.data_received = protocol.data_received  # type: ignore[method-assign]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._socket = transport
+        self._socket = cast("asyncio.Transport", transport)  # uvloop's is one by its methods only
         for level, option, value in OPTIONS:
             transport.get_extra_info("socket").setsockopt(level, option, value)
         self._protocol.connection_made(self)  # type: ignore[arg-type]  # a Transport by its methods, not by its base

@@ -6,7 +6,7 @@ Times in seconds unless the key says `_ms`; positions in the servo's unit, speed
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -82,6 +82,11 @@ class ServoOptions(Data):
     park_timeout: Positive = 5.0
     unit: str | None = None
     allow_max_speed: bool = False
+
+    @property
+    def key(self) -> Hashable:
+        """What no two servos of a bus share."""
+        return self.id
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

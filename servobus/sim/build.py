@@ -18,6 +18,7 @@ from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
 from servobus.sim.line import SimLine
 
+SIMULATED = "sim:"
 PORTS = {"sim:": True, "sim:?wire_time=off": False}
 """What a simulated port may be called, and whether bytes take time there."""
 

@@ -1,0 +1,71 @@
+"""What the link tests listen with, and the loops they run on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+import uvloop
+
+LOOPS: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
+PATIENCE = 20
+"""Seconds until a test gives up; none takes nearly as long."""
+
+
+def on_each_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[str], None]:
+    """A test that runs on asyncio's own loop and on uvloop's."""
+
+    @pytest.mark.parametrize("loop", LOOPS)
+    def run(loop: str) -> None:
+        with asyncio.Runner(loop_factory=LOOPS[loop]) as runner:
+            runner.run(test())
+
+    run.__doc__ = test.__doc__
+    return run
+
+
+class Ear(asyncio.Protocol):
+    """Keeps what it is told, in order."""
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.made = 0
+        self.lost: list[Exception | None] = []
+        self._news = asyncio.Event()
+
+    @property
+    def heard(self) -> bytes:
+        return b"".join(self.pieces)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.made += 1
+
+    def data_received(self, data: bytes) -> None:
+        assert not self.lost
+        self.pieces.append(data)
+        self._news.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.lost.append(exc)
+        self._news.set()
+
+    async def until(self, size: int) -> bytes:
+        """What was heard, when it is that many bytes."""
+        await self._until(lambda: len(self.heard) >= size)
+        return self.heard
+
+    async def gone(self) -> Exception | None:
+        """With what the line was lost; and that it was lost once."""
+        await self._until(lambda: bool(self.lost))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert len(self.lost) == 1
+        return self.lost[0]
+
+    async def _until(self, true: Callable[[], bool]) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while not true():
+                self._news.clear()
+                await self._news.wait()

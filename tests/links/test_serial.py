@@ -1,0 +1,352 @@
+"""Serial links over real PTYs: bytes, rates, full buffers, leaving, and being left."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import gc
+import os
+import termios
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servobus.errors import LinkDown
+from servobus.links.serial import MOST_UNSENT, UART_LATENCY, USB_LATENCY, DirectTransport, SerialLink
+from servobus.protocols.base import LineTraits
+from tests.links.ear import Ear, on_each_loop
+from tests.links.pty import Pty, plugged
+
+ODD_RATES = (76_800, 128_000, 250_000, 256_000, 512_000)
+TIOCVHANGUP = 0x5437
+
+
+async def filled(pty: Pty, ear: Ear) -> tuple[DirectTransport, bytes]:
+    """A transport whose kernel buffer is full, and all that it was given so far."""
+    transport = await SerialLink(pty.path, 1_000_000).connect(ear)
+    said = b""
+    while not transport.get_write_buffer_size():
+        chunk = bytes(at & 0xFF for at in range(len(said), len(said) + 1021))
+        transport.write(chunk)
+        said += chunk
+    return transport, said
+
+
+@on_each_loop
+async def test_both_ways() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 1_000_000).connect(ear)
+        assert ear.made == 1
+        every = bytes(range(256))  # none means anything to the terminal
+        transport.write(every)
+        assert await pty.hear(256) == every
+        pty.say(every)
+        assert await ear.until(256) == every
+        transport.abort()
+        assert await ear.gone() is None
+
+
+@pytest.mark.parametrize("baudrate", [9_600, 115_200, 1_000_000, *ODD_RATES])
+async def test_any_rate(baudrate: int) -> None:
+    """At open, and changed to while open, from a rate that is custom as well."""
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, baudrate).connect(Ear())
+        assert pty.baudrate() == baudrate
+        for rate in (333_333, baudrate):
+            transport.set_baudrate(rate)
+            assert pty.baudrate() == rate
+        transport.abort()
+
+
+async def test_the_rate_changes_when_everything_was_said() -> None:
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 9_600).connect(Ear())
+        transport.write(b"at the old rate")
+        transport.set_baudrate(115_200)
+        transport.set_baudrate(57_600)  # the last one counts
+        transport.write(b"at the ")
+        transport.write(b"new rate")
+        assert await pty.hear(30) == b"at the old rateat the new rate"
+        assert pty.baudrate() == 57_600
+        transport.abort()
+
+
+async def test_until_then_the_rate_is_the_old_one() -> None:
+    """Ten seconds' worth of bytes, which nobody waits for."""
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 300).connect(ear)
+        transport.write(bytes(300))
+        transport.set_baudrate(115_200)
+        transport.write(b"later")
+        assert transport.get_write_buffer_size() == 5
+        assert await pty.hear(300) == bytes(300)
+        assert (pty.baudrate(), pty.heard()) == (300, b"")
+        transport.abort()
+        assert await ear.gone() is None
+
+
+async def test_bytes_that_wait_for_a_rate_are_bounded() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 300).connect(ear)
+        transport.write(bytes(300))
+        transport.set_baudrate(115_200)
+        transport.write(bytes(MOST_UNSENT))
+        assert not transport.is_closing()
+        transport.write(b"x")
+        assert "takes no more bytes" in str(await ear.gone())
+
+
+async def test_who_closes_while_a_rate_changes_is_heard() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 9_600).connect(ear)
+        transport.write(b"old")
+        transport.set_baudrate(115_200)
+        transport.write(b"new")
+        transport.close()
+        assert await pty.hear(6) == b"oldnew"
+        assert await ear.gone() is None
+
+
+async def test_looking_hands_over_what_is_there() -> None:
+    """At once, without a pass of the loop; and finding nothing means nothing."""
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        assert transport.look()
+        pty.say(b"late")
+        assert ear.heard == b""
+        assert transport.look()
+        assert ear.heard == b"late"
+        assert transport.look()
+        assert (ear.pieces, ear.lost) == ([b"late"], [])
+        transport.abort()
+        pty.say(b"too late")
+        assert transport.look()
+        assert await ear.gone() is None
+        assert ear.heard == b"late"
+
+
+async def test_what_came_before_is_thrown_away() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        pty.say(b"of yesterday")
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.say(b"today")
+        assert await ear.until(1) == b"today"
+        transport.abort()
+
+
+@on_each_loop
+async def test_what_finds_no_room_goes_later() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, said = await filled(pty, ear)
+        transport.write(b"the end")
+        assert await pty.hear(len(said) + 7) == said + b"the end"
+        assert transport.get_write_buffer_size() == 0
+        transport.write(b"at once")
+        assert await pty.hear(7) == b"at once"
+        transport.abort()
+        assert await ear.gone() is None
+
+
+async def test_what_waits_for_room_is_bounded() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.write(bytes(MOST_UNSENT - transport.get_write_buffer_size()))
+        assert not transport.is_closing()
+        transport.write(b"x")
+        assert transport.is_closing()
+        error = await ear.gone()
+        assert isinstance(error, LinkDown)
+        assert "takes no more bytes" in str(error)
+
+
+@on_each_loop
+async def test_who_closes_is_heard_to_the_end() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, said = await filled(pty, ear)
+        transport.close()
+        transport.write(b"too late")
+        assert transport.is_closing()
+        assert await pty.hear(len(said)) == said
+        assert await ear.gone() is None
+        assert pty.heard() == b""
+
+
+@on_each_loop
+async def test_who_aborts_waits_for_nothing() -> None:
+    """The other side takes nothing, and never will."""
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.close()
+        transport.abort()
+        transport.abort()
+        assert await ear.gone() is None
+        transport.close()
+        transport.abort()
+        transport.set_baudrate(9_600)
+        assert await ear.gone() is None
+
+
+@on_each_loop
+async def test_unplugged() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.unplug()
+        error = await ear.gone()
+        assert isinstance(error, LinkDown)
+        assert str(error).startswith(f"{pty.path} was unplugged, or its other end closed: it is opened again when it is back")
+        transport.write(b"nobody")
+        assert (transport.is_closing(), ear.lost) == (True, [error])
+
+
+@pytest.mark.parametrize("verb", ["write", "look", "set_baudrate"])
+async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
+    """Reported once, though the loop finds it out as well; and not from within the call."""
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.unplug()
+        calls = {
+            "write": lambda: transport.write(b"x"),
+            "look": transport.look,
+            "set_baudrate": lambda: transport.set_baudrate(9_600),
+        }
+        calls[verb]()
+        assert (transport.is_closing(), ear.lost) == (True, [])
+        assert isinstance(await ear.gone(), LinkDown)
+
+
+@on_each_loop
+async def test_unplugged_with_a_full_buffer() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        await filled(pty, ear)
+        pty.unplug()
+        assert isinstance(await ear.gone(), LinkDown)
+
+
+@on_each_loop
+async def test_unplugged_while_closing() -> None:
+    """Whoever was leaving anyway has left."""
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.close()
+        pty.unplug()
+        assert await ear.gone() is None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may hang up a terminal")
+async def test_hung_up() -> None:
+    """Reads then find the end of a file instead of an error."""
+    ear = Ear()
+    with plugged() as pty:
+        await SerialLink(pty.path, 115_200).connect(ear)
+        fcntl.ioctl(pty.slave, TIOCVHANGUP)
+        assert isinstance(await ear.gone(), LinkDown)
+
+
+async def test_the_port_is_free_when_the_loss_was_told() -> None:
+    """Also for the next user, who finds it open for everybody."""
+    with plugged() as pty:
+        for leave in ("close", "abort"):
+            ear = Ear()
+            transport = await SerialLink(pty.path, 115_200).connect(ear)
+            getattr(transport, leave)()
+            assert await ear.gone() is None
+            fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(pty.slave, fcntl.LOCK_UN)
+
+
+async def test_no_rs485_mode() -> None:
+    """The message names the option; the port is left free."""
+    ear = Ear()
+    with plugged() as pty:
+        with pytest.raises(LinkDown, match=r"no RS485 mode: take out `rs485: true`"):
+            await SerialLink(pty.path, 115_200, rs485=True).connect(ear)
+        fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        assert (ear.made, ear.lost) == (0, [])
+
+
+@pytest.mark.parametrize("rs485", [False, True])
+async def test_cancelled_while_it_opens(rs485: bool) -> None:
+    """What the thread opens then, or fails to, is nobody's: the port is free again, and nothing is complained about."""
+    loop = asyncio.get_running_loop()
+    complaints: list[dict[str, Any]] = []
+    loop.set_exception_handler(lambda loop, context: complaints.append(context))
+    loop.set_default_executor(ThreadPoolExecutor(1))
+    ear = Ear()
+    with plugged() as pty:
+        task = asyncio.create_task(SerialLink(pty.path, 115_200, rs485=rs485).connect(ear))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await loop.run_in_executor(None, int)  # behind the opening, in the only thread
+        fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    gc.collect()
+    assert (ear.made, complaints) == (0, [])
+
+
+async def test_cancelled_as_it_opened() -> None:
+    class Impatient(Ear):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            task.cancel()
+
+    ear = Impatient()
+    with plugged() as pty:
+        task = asyncio.create_task(SerialLink(pty.path, 115_200).connect(ear))
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await ear.gone() is None
+        fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_traits_of_a_pty() -> None:
+    """Its bytes take no time, but whoever simulates may take it."""
+    with plugged() as pty:
+        assert SerialLink(pty.path, 115_200).traits == LineTraits(115_200, can_change_baud=True)
+
+
+@pytest.mark.parametrize(
+    ("device", "latency"),
+    [("ttyUSB0", USB_LATENCY), ("ttyACM12", USB_LATENCY), ("ttyS0", UART_LATENCY), ("ttyAMA0", UART_LATENCY)],
+)
+def test_traits_of_a_port(tmp_path: Path, device: str, latency: float) -> None:
+    """By the device, whatever link leads to it."""
+    (tmp_path / device).touch()
+    (tmp_path / "arm").symlink_to(device)
+    link = SerialLink(str(tmp_path / "arm"), 76_800)
+    assert link.address == str(tmp_path / "arm")
+    assert link.traits == LineTraits(76_800, paced=True, latency=latency, can_change_baud=True)
+
+
+async def test_the_line_is_raw() -> None:
+    """Nothing is translated, echoed or taken as a signal, and there is no flow control."""
+    with plugged() as pty:
+        cooked = termios.tcgetattr(pty.slave)
+        cooked[0] |= termios.ICRNL | termios.IXON
+        cooked[1] |= termios.OPOST | termios.ONLCR
+        cooked[3] |= termios.ICANON | termios.ECHO | termios.ISIG
+        termios.tcsetattr(pty.slave, termios.TCSANOW, cooked)
+        ear = Ear()
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.say(b"\r\n\x03\x11\x13\x04")
+        assert await ear.until(6) == b"\r\n\x03\x11\x13\x04"
+        transport.write(b"\r\n")
+        assert await pty.hear(2) == b"\r\n"
+        assert pty.heard() == b""
+        transport.abort()
