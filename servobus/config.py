@@ -38,6 +38,11 @@ class Config:
     models: Mapping[str, Mapping[str, ServoModel]]
     """Bus -> model name -> model."""
 
+    @property
+    def names(self) -> dict[str, tuple[str, str]]:
+        """bus/servo -> (bus, servo), in the order of the file."""
+        return {f"{bus}/{servo}": (bus, servo) for bus, options in self.buses.items() for servo in options.servos}
+
 
 def load_config(path: str | Path) -> Config:
     """The config in a file; model files are looked for beside it. Raises ConfigError."""

@@ -48,7 +48,7 @@ class LocalRig(Rig):
         self.config = config
         self.buses: dict[str, BusService] = {}
         self.links: dict[str, Link] = {}
-        self._names: dict[str, tuple[str, str]] = {}
+        self._names = {name: place for name, place in config.names.items() if not only or place[0] in only}
         self._tried: dict[str, asyncio.Event] = {}
         self._down: dict[str, LinkDown] = {}
         self._parking: set[asyncio.Task[None]] = set()
@@ -64,7 +64,6 @@ class LocalRig(Rig):
         self.links[name] = link
         self.buses[name] = BusService(name, options, driver, entry.codec(), link.traits, self._event)
         self._tried[name] = asyncio.Event()
-        self._names.update({f"{name}/{servo}": (name, servo) for servo in driver.nodes})
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:

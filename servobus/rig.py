@@ -32,6 +32,18 @@ class Found:
     note: str = ""
 
 
+def full_name(names: Mapping[str, tuple[str, str]], name: str) -> str:
+    """bus/servo for a full or a unique bare name; `names` as in `Rig.names`. Raises UnknownName and lists what there is."""
+    if name in names:
+        return name
+    matches = [full for full, (_, servo) in names.items() if servo == name]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        raise UnknownName(f"{name!r} is on several buses: say one of {', '.join(matches)}")
+    raise UnknownName(f"no servo {name!r}: there are {', '.join(names) or 'none'}")
+
+
 class Servo:
     """One servo of a rig: the rig's verbs with the name filled in."""
 
@@ -116,14 +128,7 @@ class Rig(ABC):
 
     def full_name(self, name: str) -> str:
         """bus/servo for a full or a unique bare name. Raises UnknownName and lists what there is."""
-        if name in self.names:
-            return name
-        matches = [full for full, (_, servo) in self.names.items() if servo == name]
-        if len(matches) == 1:
-            return matches[0]
-        if matches:
-            raise UnknownName(f"{name!r} is on several buses: say one of {', '.join(matches)}")
-        raise UnknownName(f"no servo {name!r}: there are {', '.join(self.names) or 'none'}")
+        return full_name(self.names, name)
 
     def full_names(self, names: Iterable[str]) -> list[str]:
         """The same for several; none given: all."""

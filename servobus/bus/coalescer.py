@@ -110,8 +110,9 @@ class Coalescer:
         for ticket in ended:
             if not ticket.gone():
                 ticket.done(error(ticket.servo))
+        reason = f"it was asked for together with {names}, which was dropped before it could leave: nothing was sent"
         for ticket in mates:
-            ticket.done(ActionWithheld(f"it was asked for together with {names}, dropped meanwhile: nothing was sent", servo=ticket.servo))
+            ticket.done(ActionWithheld(reason, servo=ticket.servo))
 
     def _mates(self, first: Ticket, ready: Collection[int]) -> list[Ticket]:
         """All that can leave with this one; empty while it cannot leave."""

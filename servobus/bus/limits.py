@@ -36,10 +36,8 @@ def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | N
         fastest = abs(goal.value - setpoint) / options.max_speed
         if goal.duration < fastest:
             if options.on_limit == "reject":
-                raise LimitError(
-                    f"duration: {goal.duration:g} s needs more than max_speed {options.max_speed:g}: give {fastest:.3g} s or more",
-                    servo=name,
-                )
+                reason = f"is too short for max_speed {options.max_speed:g}: give {fastest:.3g} s or more"
+                raise LimitError(f"duration: {goal.duration:g} s {reason}", servo=name)
             goal = replace(goal, duration=fastest)
     return goal
 

@@ -15,6 +15,8 @@ START_QUIET = 0.020
 """After opening: a servo may still be answering somebody else, or hold half a frame."""
 BABBLE = 0.250
 """Seconds of uninterrupted talk after which it is no late reply any more."""
+ECHO_LIMIT = 4096
+"""Bytes of our own that may be waited for."""
 
 
 class EchoFilter:
@@ -28,6 +30,9 @@ class EchoFilter:
         """Times something else was heard where our own bytes were due."""
 
     def sent(self, frame: bytes) -> None:
+        if len(self._expected) + len(frame) > ECHO_LIMIT:  # the line does not echo at all
+            self.collisions += 1
+            self._expected = b""
         self._expected += frame
 
     def strip(self, data: bytes) -> bytes:
@@ -55,27 +60,30 @@ class Line:
         self.traits = traits
         self.echo: EchoFilter | None = None
         self.babbling = False
-        """It has talked without a pause for too long; only an e-stop is still said."""
+        """It has talked without a pause for too long, and has not been quiet since; only an e-stop is still said."""
         self.drains = 0
         self.sent_by = 0.0
         """When everything handed to the UART has left it."""
         self._last_start = 0.0
         """When the last frame began to leave: until then no other is handed over."""
         self._quiet_at = 0.0
+        """Until then nothing is said."""
         self._listening_since: float | None = None
 
     def opened(self, now: float) -> None:
         self.sent_by = self._last_start = now
         self._listening_since = None
+        self._quiet_at = 0.0
         self.babbling = False
         self.listen_out(now, START_QUIET)
 
     def listen_out(self, now: float, quiet: float = QUIET) -> None:
-        """Something was heard or missed that was not expected: wait for silence from here."""
+        """Something was heard or missed that was not expected: wait for silence from here. A longer silence that is due already
+        is not cut short."""
         if self._listening_since is None:
             self._listening_since = now
             self.drains += 1
-        self._quiet_at = now + quiet
+        self._quiet_at = max(self._quiet_at, now + max(quiet, self.traits.gap, 2 * self.traits.byte_time))
 
     @property
     def listening_out(self) -> bool:
@@ -83,33 +91,38 @@ class Line:
 
     def ready_at(self, now: float, *, urgent: bool) -> float:
         """When the next frame may be handed over; not after `now`: at once."""
-        if self._listening_since is not None and now < self._quiet_at:
+        if now >= self._quiet_at:
+            if self._listening_since is not None:
+                self.babbling = False
+            return self._last_start
+        if self._listening_since is not None:
             self.babbling = self.babbling or now - self._listening_since > BABBLE
-            if not (self.babbling and urgent):  # an e-stop is not held back by a node that never stops talking
-                return self._quiet_at
-        return max(self._quiet_at if self._listening_since is None else now, self._last_start)
+        if self.babbling and urgent:  # an e-stop is not held back by a node that never stops talking
+            return self._last_start
+        return max(self._quiet_at, self._last_start)
 
     def quiet(self) -> None:
         """It was listened out, and is about to be spoken on."""
         self._listening_since = None
-        self.babbling = False
         if self.echo is not None:
             self.echo.reset()
 
     def speak(self, frame: bytes, now: float, quiet_after: float) -> float:
-        """A frame is handed over; when its first byte leaves."""
-        start = max(now, self.sent_by) + self.traits.gap
+        """A frame is handed over; when its first byte leaves. Where silence must go before the next, none is queued behind it."""
+        start = max(now, self.sent_by)
         self._last_start = start
         self.sent_by = start + len(frame) * self.traits.byte_time
-        self._quiet_at = self.sent_by + quiet_after if quiet_after else 0.0
+        silence = max(quiet_after, self.traits.gap)
+        self._quiet_at = self.sent_by + silence if silence else 0.0
         if self.echo is not None:
             self.echo.sent(frame)
         return start
 
     def answered(self, now: float, quiet_after: float) -> None:
-        """The answer is here, so all that was said has left, however soon that was (a PTY has no wire). Then the silence that must
-        follow."""
+        """The answer is here, so all that was said has left, however soon that was (a PTY has no wire). Then the silence that
+        must follow."""
         if self.sent_by > now:
             self.sent_by = self._last_start = now
-        if quiet_after:
-            self._quiet_at = now + quiet_after
+        silence = max(quiet_after, self.traits.gap)
+        if silence:
+            self._quiet_at = now + silence

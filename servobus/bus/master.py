@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
-from servobus.bus.line import Line
+from servobus.bus.line import QUIET, Line
 from servobus.bus.queue import Job
 from servobus.bus.runner import Runner
 from servobus.bus.turn import Turn, judge
@@ -164,8 +164,10 @@ class BusMaster(asyncio.Protocol):
         """Say whatever may be said now, and make sure to be woken for what may be said later."""
         while self._transport is not None and self._turn is None:
             now = self._clock()
-            ready = self.line.ready_at(now, urgent=bool(self._scheduler.estop))
+            ready = self.line.ready_at(now, urgent=self.runner.urgent)
             if ready > now:
+                if self.line.babbling:
+                    self.runner.babbled()
                 self._scheduler.expire(now)
                 self._arm(ready)
                 return
@@ -223,7 +225,7 @@ class BusMaster(asyncio.Protocol):
         self._turn = None
         self._counts["timeouts"] += 1
         self._counts["echoes"] += turn.echoes
-        self.line.listen_out(now)
+        self.line.listen_out(now, max(QUIET, turn.request.quiet_after))
         self.runner.missed(turn, now, self._latency(turn, now))
         self._pump()
 

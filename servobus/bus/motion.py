@@ -114,7 +114,7 @@ class Motion:
 
     async def disable(self, servo: str) -> None:
         record = self._bus.records[servo]
-        self._bus.scheduler.coalescer.drop(self._disabled, {record.node.id})
+        self._bus.scheduler.drop_goals(self._disabled, {servo})
         self._set_enabled(record, False)
         report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
         if not report.confirmed:
@@ -201,7 +201,7 @@ class Motion:
         for record in restarted:
             record.setpoint = None
             self._set_enabled(record, False)
-        self._bus.scheduler.coalescer.drop(self._disabled, {node.id})
+        self._bus.scheduler.drop_goals(self._disabled, {record.name for record in self._bus.on(node)})
         return restarted
 
     async def leave(self) -> dict[str, StopReport]:

@@ -160,14 +160,15 @@ class RequestQueue:
 
     def remove(self, unwanted: Callable[[Job], bool]) -> list[Job]:
         """Take out all jobs that are unwanted, in order for each node."""
-        removed = []
+        removed: list[Job] = []
         for node, line in list(self._lines.items()):
-            out = [job for job in line if unwanted(job)]
-            if len(out) == len(line):
+            kept: deque[Job] = deque()
+            for job in line:
+                (removed if unwanted(job) else kept).append(job)
+            if kept:
+                self._lines[node] = kept
+            else:
                 del self._lines[node]
-            elif out:
-                self._lines[node] = deque(job for job in line if job not in out)
-            removed += out
         self._length -= len(removed)
         return removed
 

@@ -8,6 +8,7 @@ The master asks `next_request` when the line is free, and reports how the turn e
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from servobus.bus.health import Condition, Health
@@ -34,6 +35,11 @@ class Runner:
         """No plan is under way, so nothing needs to be waited for."""
         return self._run is None
 
+    @property
+    def urgent(self) -> bool:
+        """An e-stop waits, or is under way: it is said even on a line that never falls quiet."""
+        return bool(self.scheduler.estop) or (self._run is not None and self._run.estop)
+
     # What is said next
 
     def next_request(self, now: float) -> Request[Any] | None:
@@ -48,8 +54,7 @@ class Runner:
             # Its answer could be taken for one that is still under way: a fence goes before it.
             self.stats.counts["fences"] += 1
             recovery = self.scheduler.recovery(doubtful)
-            if self._step(run, lambda run=run, recovery=recovery: run.detour(recovery)):  # type: ignore[misc]
-                return run.request
+            self._step(run, partial(run.detour, recovery))
         return None
 
     def _doubtful(self, request: Request[Any]) -> Any:
@@ -61,24 +66,27 @@ class Runner:
 
     def _current(self, now: float) -> Run | None:
         """The run that has the line, begun if need be."""
-        if self.scheduler.estop and self._suspended is None:
-            self._make_way()
-        if self._run is None and self._suspended is not None and not self.scheduler.estop:
-            self._run, self._suspended = self._suspended, None
+        if self.scheduler.estop and self._run is not None and not self._run.estop:
+            self._make_way(self._run)
         while self._run is None:
+            estop = bool(self.scheduler.estop)
+            if self._suspended is not None and not estop:
+                self._run, self._suspended = self._suspended, None
+                return self._run
             job = self.scheduler.next_turn(now)
             if job is None:
                 return None
-            run = Run(job)
+            run = Run(job, estop=estop)
             self._run = run
             self.stats.counts["fences"] += job.recovery
             self._step(run, run.begin)
         return self._run
 
-    def _make_way(self) -> None:
-        """For an e-stop: what moves ends here, anything else goes on afterwards."""
-        run, self._run = self._run, None
-        if run is not None and run.job.motion:
+    def _make_way(self, run: Run) -> None:
+        """For an e-stop: what moves ends here, anything else goes on afterwards. Never for a second e-stop: a hold that goes on
+        after a limp would switch the torque on again."""
+        self._run = None
+        if run.job.motion:
             run.job.fail(self.estopped(""))
         else:
             self._suspended = run
@@ -91,13 +99,11 @@ class Runner:
 
     def answered(self, turn: Turn, now: float, latency: float) -> None:
         """All answers are here."""
-        self._learn(turn, now, latency)
-        try:
-            value = turn.request.parse(turn.replies)
-        except ServobusError as error:
-            self._fail(error)
-        else:
-            self._resolve(value)
+        for reply in turn.replies:
+            node = self.health.node(reply.node)
+            node.answered(reply.status, now)
+            node.learn(latency)
+        self._conclude(turn)
 
     def missed(self, turn: Turn, now: float, latency: float) -> None:
         """An answer is missing, or the window cannot be believed. The silent nodes become doubtful; the request is said again
@@ -107,10 +113,17 @@ class Runner:
         for node_id in request.nodes if rejected else turn.missing():
             self.health.missed(self.health.node(node_id), request.reply_key, turn.sent_at, now)
         if request.partial and turn.replies and not rejected:
-            self._learn(turn, now, latency)
-            self._resolve(request.parse(turn.replies))
+            for reply in turn.replies:  # how soon they came is not known: the deadline ended this turn
+                self.health.node(reply.node).answered(reply.status, now)
+            self._conclude(turn)
         else:
             self._again(turn)
+
+    def babbled(self) -> None:
+        """The line never falls quiet: the plan under way ends, and only an e-stop is still said."""
+        if self._run is not None and not self._run.estop:
+            run, self._run = self._run, None
+            run.job.fail(ReplyTimeout("the line never falls quiet: who talks on it without a pause?", bus=self.bus))
 
     def strays(self, replies: list[Reply], turn: Turn | None, now: float) -> None:
         """Valid frames that answer nothing: each node may have said the same once more, or says now what was given up."""
@@ -135,11 +148,13 @@ class Runner:
     def estopped(self, servo: str) -> ServobusError:
         return EStopped("the e-stop came first: nothing more was sent", bus=self.bus, servo=servo or None)
 
-    def _learn(self, turn: Turn, now: float, latency: float) -> None:
-        for reply in turn.replies:
-            node = self.health.node(reply.node)
-            node.answered(reply.status, now)
-            node.learn(latency)
+    def _conclude(self, turn: Turn) -> None:
+        try:
+            value = turn.request.parse(turn.replies)
+        except Exception as error:  # noqa: BLE001 - whatever it is, its caller is told
+            self._fail(error)
+        else:
+            self._resolve(value)
 
     def _again(self, turn: Turn) -> None:
         """Say it once more, or give it up."""
@@ -147,12 +162,13 @@ class Runner:
         assert run is not None
         run.attempts += 1
         offline = any(self.health.node(node).condition is Condition.OFFLINE for node in request.nodes)
-        if not request.idempotent or run.attempts >= run.job.tries or offline:
-            self._fail(self._timeout(run.attempts, request))
+        # A recovery is never repeated in the middle: what it asked may still be answered, and must be fenced again.
+        if not request.idempotent or run.recovering or run.attempts >= run.job.tries or offline:
+            self._fail(self._timeout(run.attempts, request), offline=offline)
             return
         self.stats.counts["retries"] += 1
         run.request = (request.plain() if turn.echoes else None) or request
-        if run.job.plan is None and not run.recovering:
+        if run.job.plan is None:
             # It stays the first of its node, and the other nodes have their turns before it.
             self._run = None
             run.job.attempts, run.job.request = run.attempts, run.request
@@ -176,26 +192,25 @@ class Runner:
             self._run = None
             run.job.succeed(value)
             return
-        self._step(run, lambda: self._advance(run, value))
+        self._step(run, partial(run.succeed, value))
 
-    def _fail(self, error: ServobusError) -> None:
+    def _fail(self, error: Exception, *, offline: bool = False) -> None:
         run = self._run
         assert run is not None
-        self._step(run, lambda: run.fail(error))
+        self._step(run, partial(run.fail, error, offline=offline))
 
-    @staticmethod
-    def _advance(run: Run, value: Any) -> None:
-        if run.succeed(value) is False and run.job.motion:
-            raise NotEnabled("the servo has restarted and is disabled: nothing was sent; enable it again")
-
-    def _step(self, run: Run, step: Callable[[], object]) -> bool:
-        """Move the run on; False: that ended its job."""
+    def _step(self, run: Run, step: Callable[[], bool | None]) -> None:
+        """Move the run on, or end its job."""
         try:
-            step()
-            return True
+            kept = step()
+            if kept is not False or not run.job.motion:
+                return
+            error: Exception = NotEnabled("the servo has restarted and is disabled: nothing was sent; enable it again")
         except Finished as end:
+            self._run = None
             run.job.succeed(end.value)
-        except ServobusError as error:
-            run.job.fail(error.at(bus=self.bus))
+            return
+        except Exception as raised:  # noqa: BLE001 - a mistake in a driver ends its job, never the bus
+            error = raised
         self._run = None
-        return False
+        run.job.fail(error.at(bus=self.bus) if isinstance(error, ServobusError) else error)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,6 @@ QUEUE_LIMIT = 1024
 """Jobs that may wait on one bus."""
 POLL_PATIENCE = 1.0
 """Seconds after which a poll that could not be sent is not wanted any more."""
-
 
 OFFLINE = "it is offline: is it powered, are id and baud rate right? It is probed, and served again as soon as it answers"
 
@@ -66,13 +65,17 @@ class Scheduler:
         self.session: object = None
         """While set, polls, probes and goals rest and only this session's requests are served."""
         self.split_groups = 0
+        self.goal_turns = 0
         self._limit = limit
         self._on_update = on_update
         self._on_restart = on_restart
         self._goal_jobs: deque[tuple[Job, list[Ticket]]] = deque()
         self._polls: list[PollTimer] = []
         self._poll_due = math.inf
+        self._missed_before = 0
         self._parked: list[Job] = []
+        self._parked_until = math.inf
+        """When the first of those set aside has waited long enough."""
         self._lanes = (self._next_goal, self._next_request, self._next_poll, self._next_probe)
         self._upwards = list(enumerate(self._lanes))[::-1]
         self._owed = [False] * len(self._lanes)
@@ -86,8 +89,7 @@ class Scheduler:
         if node.condition is Condition.OFFLINE and not job.urgent:
             if len(self._parked) >= self._limit:
                 raise overloaded(len(self._parked))
-            job.expires = min(job.expires, now + node.deadline)
-            self._parked.append(job)
+            self._park([job], now + node.deadline)
         else:
             self.requests.put(job)
 
@@ -97,13 +99,14 @@ class Scheduler:
 
     def set_polls(self, polls: Sequence[Poll], now: float) -> None:
         """Polls of one rate are spread over their period."""
+        self._missed_before = self.missed_polls
         self._polls = [PollTimer(poll, now + index / len(polls) / poll.hz) for index, poll in enumerate(polls)]
         self._poll_due = min((timer.due for timer in self._polls), default=math.inf)
 
     @property
     def missed_polls(self) -> int:
-        """Grid points that passed without their poll."""
-        return sum(timer.missed for timer in self._polls)
+        """Grid points that passed without their poll, since the beginning."""
+        return self._missed_before + sum(timer.missed for timer in self._polls)
 
     def waiting(self) -> int:
         """Everything that waits, for people."""
@@ -113,6 +116,8 @@ class Scheduler:
 
     def next_turn(self, now: float) -> Job | None:
         """What shall be on the wire next; None: nothing yet, see `wake`."""
+        if now >= self._parked_until:  # on a busy line nobody calls `expire`
+            self._end_parked(now)
         if self.estop:
             return self.estop.popleft()
         if self.session is not None:
@@ -120,7 +125,7 @@ class Scheduler:
         for lane, take in enumerate(self._lanes):
             if not self._owed[lane] and (job := take(now)) is not None:
                 return self._served(lane, job)
-        # Nobody waits to whom a turn is owed, so the others may go on; the lowest of them first, for it is owed one by those above.
+        # Nobody waits to whom a turn is owed, so the others may go on; the lowest of them first: those above owe it one.
         for lane, take in self._upwards:
             if self._owed[lane] and (job := take(now)) is not None:
                 return self._served(lane, job)
@@ -136,7 +141,7 @@ class Scheduler:
     def wake(self) -> float | None:
         """The next moment at which something becomes due or too old, if nothing else happens."""
         times = [self.requests.next_expiry(), self.coalescer.next_expiry()]
-        times.extend(job.expires for job in self._parked)
+        times.append(self._parked_until if self._parked else None)
         if self.session is None:
             times.append(self.health.next_probe())
             times.append(self._poll_due if self._polls else None)
@@ -146,33 +151,53 @@ class Scheduler:
         """End what is too old. Called when nothing can be sent, or nothing is due."""
         self.requests.expire(now)
         self.coalescer.expire(now)
-        if not self._parked:
-            return
-        late = [job for job in self._parked if job.expires <= now or job.sink.done()]
-        if late:
-            self._parked = [job for job in self._parked if job not in late]
-            for job in late:
-                job.fail(ReplyTimeout(OFFLINE, request=job.request, raw=job.request.frame if job.request else b""))
+        self._end_parked(now)
 
     def node_changed(self, node: Node) -> None:
         """Jobs set aside for a node that came back go on; those in the queue of one that went offline are set aside."""
         if node.condition is Condition.OFFLINE:
-            self._parked.extend(self.requests.remove(lambda job: job.node == node.id and not job.urgent))
+            went = node.next_probe - node.backoff
+            self._park(self.requests.remove(lambda job: job.node == node.id and not job.urgent), went + node.deadline)
             return
-        back = [job for job in self._parked if job.node == node.id]
-        if back:
-            self._parked = [job for job in self._parked if job.node != node.id]
-            for job in reversed(back):
-                self.requests.put_back(job)
+        for job in reversed(self._unpark(lambda job: job.node == node.id)):
+            self.requests.put_back(job)
+
+    def _park(self, jobs: Sequence[Job], until: float) -> None:
+        for job in jobs:
+            job.expires = min(job.expires, until)
+            self._parked_until = min(self._parked_until, job.expires)
+        self._parked.extend(jobs)
+
+    def _unpark(self, wanted: Callable[[Job], bool]) -> list[Job]:
+        out: list[Job] = []
+        kept: list[Job] = []
+        for job in self._parked:
+            (out if wanted(job) else kept).append(job)
+        self._parked = kept
+        self._parked_until = min((job.expires for job in kept), default=math.inf)
+        return out
+
+    def _end_parked(self, now: float) -> None:
+        for job in self._unpark(lambda job: job.expires <= now or job.sink.done()):
+            job.fail(ReplyTimeout(OFFLINE, request=job.request, raw=job.request.frame if job.request else b""))
+
+    def drop_goals(self, error: Callable[[str], ServobusError], servos: Collection[str] | None = None) -> None:
+        """End all goals that have not left, or those of some servos, with an error; the others of a frame are planned anew."""
+        goal_jobs, self._goal_jobs = self._goal_jobs, deque()
+        for job, tickets in goal_jobs:
+            if servos is None or any(ticket.servo in servos for ticket in tickets):
+                self._unplan(job, tickets)
+            else:
+                self._goal_jobs.append((job, tickets))
+        self.coalescer.drop(error, servos)
 
     def drop(self, error: Callable[[str], ServobusError], *, motion_only: bool) -> None:
         """End everything that waits, or only what would move something."""
-        self.coalescer.drop(error)
-        goal_jobs, self._goal_jobs = self._goal_jobs, deque()
-        unwanted = [*(job for job, _ in goal_jobs), *self.requests.remove(lambda job: job.motion or not motion_only)]
+        self.drop_goals(error)
+        unwanted = self.requests.remove(lambda job: job.motion or not motion_only)
+        unwanted += self._unpark(lambda job: job.motion or not motion_only)
         if not motion_only:
-            unwanted.extend((*self._parked, *self.estop))
-            self._parked.clear()
+            unwanted += self.estop
             self.estop.clear()
         for job in unwanted:
             job.fail(error(""))
@@ -183,14 +208,19 @@ class Scheduler:
         while self._goal_jobs or self._plan_goals(now):
             job, tickets = self._goal_jobs.popleft()
             ready = self.health.reachable()
-            if all(ticket.node in ready for ticket in tickets):
+            if all(ticket.node in ready and ticket.expires > now and not ticket.gone() for ticket in tickets):
+                self.goal_turns += 1
                 return job
-            # A frame of a split group waited, and meanwhile a servo of it missed an answer: it may have restarted.
-            assert job.plan is not None
-            job.plan.close()
-            for ticket in tickets:
-                self.coalescer.put_back(ticket)
+            # A frame of a split group waited, and is too old now, or a servo of it missed an answer: it may have restarted.
+            self._unplan(job, tickets)
         return None
+
+    def _unplan(self, job: Job, tickets: Sequence[Ticket]) -> None:
+        """The frame does not leave; its goals wait again."""
+        assert job.plan is not None
+        job.plan.close()
+        for ticket in tickets:
+            self.coalescer.put_back(ticket)
 
     def _plan_goals(self, now: float) -> bool:
         """Make jobs of the next group; False: none is ready."""
@@ -202,7 +232,7 @@ class Scheduler:
                 turns = self.driver.plan(
                     [ticket.goal for ticket in group.tickets], together=group.together, confirm=group.confirm
                 )
-            except ServobusError as error:
+            except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its goals, never the bus
                 for ticket in group.tickets:
                     ticket.done(error)
                 continue

@@ -52,7 +52,7 @@ class BusService:
         greatest = {} if options.timeout_ms is None else {"greatest_deadline": options.timeout_ms / 1000}
         self.health = Health(set(driver.nodes.values()), changed=self._changed, **greatest)
         self.stats = BusStats(self.clock())
-        self.scheduler = Scheduler(driver, self.health, on_update=self._updated, on_restart=self._restarted)
+        self.scheduler = Scheduler(driver, self.health, on_update=self._polled, on_restart=self._restarted)
         self.line = Line(traits)
         if options.echo == "on":
             self.line.echo = EchoFilter()
@@ -169,6 +169,7 @@ class BusService:
         counts["drains"] = self.line.drains
         counts["polls_missed"] = self.scheduler.missed_polls
         counts["goal_groups_split"] = self.scheduler.split_groups
+        counts["goal_turns"] = self.scheduler.goal_turns
         nodes = {
             str(node.id): {"health": node.condition.value, "misses": node.misses, "deadline_ms": round(1e3 * node.deadline, 3)}
             for node in self.health.nodes.values()
@@ -218,12 +219,16 @@ class BusService:
 
     # What the engine tells
 
-    def _updated(self, result: dict[str, Update] | Exception) -> None:
-        """A poll or a read has brought something; a failed poll stands in the node's health."""
+    def _polled(self, result: dict[str, Update] | Exception) -> None:
+        """A poll has ended; one that failed stands in its nodes' health."""
         if isinstance(result, dict):
-            now = self.clock()
-            for servo, fields in result.items():
-                self.records[servo].update(fields, now)
+            self.stats.counts["polled"] += len(result)
+            self._updated(result)
+
+    def _updated(self, result: dict[str, Update]) -> None:
+        now = self.clock()
+        for servo, fields in result.items():
+            self.records[servo].update(fields, now)
 
     def _restarted(self, node: Node) -> None:
         self.stats.counts["restarts"] += 1

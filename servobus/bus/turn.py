@@ -1,24 +1,25 @@
 """What is on the wire: a turn (one request and what was heard since), and a run (the job it belongs to). Pure.
 
 A turn judges the window it listens in. Valid replies that are no answer are strays, a frame identical to the request
-is an echo and never an answer by itself, and when the last answer is followed by bytes that are no frame the whole
-window is rejected.
+is an echo and never an answer by itself. Bytes that are no frame cast doubt on the answer before them, for with an
+8-bit sum they may be what is left of another frame that was cut in two by accident: that answer is not believed, and
+when it was the last the whole window is rejected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable
 from typing import Any
 
 from servobus.bus.queue import Job
-from servobus.errors import ServobusError
+from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Codec, Plan, Reply, Request
 
 
 class Turn:
     """One request under way."""
 
-    __slots__ = ("deadline", "echoes", "looked", "replies", "request", "sent_at", "sent_by")
+    __slots__ = ("deadline", "echoes", "looked", "replies", "request", "sent_at", "sent_by", "skipped", "torn")
 
     def __init__(self, request: Request[Any], *, sent_at: float, sent_by: float, deadline: float) -> None:
         self.request = request
@@ -31,6 +32,10 @@ class Turn:
         self.echoes = 0
         self.looked = False
         """The line was looked at once more after the deadline."""
+        self.skipped = -1
+        """What the codec had skipped when the last frame was heard; before the first frame anything may be skipped."""
+        self.torn: set[int] = set()
+        """Nodes whose answer was followed by bytes that are no frame."""
 
     def offer(self, reply: Reply) -> bool:
         """Take a valid frame; False: it is a stray."""
@@ -41,8 +46,15 @@ class Turn:
             return False
         if self.replies and any(earlier.node == reply.node for earlier in self.replies):
             return False
+        if reply.node in self.torn:
+            return False
         self.replies.append(reply)
         return True
+
+    def tear(self) -> None:
+        """What stands behind the last answer is no frame."""
+        if self.replies:
+            self.torn.add(self.replies.pop().node)
 
     def complete(self) -> bool:
         return len(self.replies) == self.request.replies
@@ -64,10 +76,11 @@ class Finished(Exception):
 class Run:
     """A job that has begun: which request is next. A recovery can be put before any request; its end leads back to it."""
 
-    __slots__ = ("_detour", "_resume", "attempts", "job", "recovering", "request")
+    __slots__ = ("_detour", "_resume", "attempts", "estop", "job", "recovering", "request")
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, *, estop: bool = False) -> None:
         self.job = job
+        self.estop = estop
         self.attempts = job.attempts
         """Times the present request was said in vain."""
         self.recovering = job.recovery
@@ -88,64 +101,77 @@ class Run:
             assert self.job.plan is not None
             self.request = _step(self.job.plan, None)
 
-    def detour(self, recovery: Plan[bool]) -> None:
-        """Recover the node first, then say the present request."""
+    def detour(self, recovery: Plan[bool]) -> bool | None:
+        """Recover the node first, then say the present request. Returns and raises as `succeed`."""
         self._resume, self._detour, self.recovering = (self.request, self.attempts), recovery, True
-        self.attempts = 0
-        self.request = _step(recovery, None)
+        return self._along(_step, None)
 
     def succeed(self, value: Any) -> bool | None:
         """The present request has its value. Returns whether the node kept its state, when a detour ended with this, else None.
         Raises Finished when the job has its result, or the plan's own error."""
-        self.attempts = 0
         if self._detour is not None:
-            try:
-                self.request = _step(self._detour, value)
-            except Finished as end:
-                self._leave_detour()
-                return bool(end.value)
-            return None
+            return self._along(_step, value)
+        self.attempts = 0
         if self.job.plan is None:
             raise Finished(value)
         self.request = _step(self.job.plan, value)
         return None
 
-    def fail(self, error: ServobusError) -> None:
-        """The present request is given up. Raises Finished or an error when that ends the job."""
-        self.attempts = 0
+    def fail(self, error: Exception, *, offline: bool = False) -> bool | None:
+        """The present request is given up. Returns and raises as `succeed`. An unanswered detour costs the request one of its
+        tries, all of them when the node is offline."""
         if self._detour is not None:
-            try:
-                self.request = self._detour.throw(error)
-                return
-            except ServobusError as raised:
-                self._leave_detour()
-                self.attempts = 0
-                error = raised
+            return self._along(_throw, error, last=offline)
+        self._give_up(error)
+        return None
+
+    def _along(self, step: Callable[[Plan[bool], Any], Request[Any]], value: Any, *, last: bool = False) -> bool | None:
+        """One step of the detour, or from its end back to the request."""
+        assert self._detour is not None
+        self.attempts = 0
+        try:
+            self.request = step(self._detour, value)
+        except Finished as end:
+            self._leave_detour()
+            return bool(end.value)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the job is told
+            self._leave_detour()
+            self.attempts += 1
+            if last or self.attempts >= self.job.tries or not isinstance(error, ReplyTimeout):
+                self._give_up(error)
+        return None
+
+    def _give_up(self, error: Exception) -> None:
+        self.attempts = 0
         if self.job.plan is None:
             raise error
-        try:
-            self.request = self.job.plan.throw(error)
-        except StopIteration as stop:
-            raise Finished(stop.value) from None
+        self.request = _throw(self.job.plan, error)
 
     def _leave_detour(self) -> None:
         assert self._resume is not None
         (self.request, self.attempts), self._detour, self._resume, self.recovering = self._resume, None, None, self.job.recovery
 
 
-def _step(plan: Generator[Request[Any], Any, Any], value: Any) -> Request[Any]:
+def _step(plan: Plan[Any], value: Any) -> Request[Any]:
     try:
         return plan.send(value)
     except StopIteration as stop:
         raise Finished(stop.value) from None
 
 
+def _throw(plan: Plan[Any], error: Exception) -> Request[Any]:
+    try:
+        return plan.throw(error)
+    except StopIteration as stop:
+        raise Finished(stop.value) from None
+
+
 def judge(codec: Codec, turn: Turn, strays: list[Reply]) -> bool:
-    """Hear out what the codec holds. True: the turn has all its answers and the window ends with a whole frame, not with bytes that
-    are none: with an 8-bit sum, those behind a frame may be what is left of another that was cut in two by accident."""
-    skipped = codec.skipped
+    """Hear out what the codec holds. True: the turn has all its answers, and the window ends with a whole frame."""
     while (reply := codec.next_reply()) is not None:
-        skipped = codec.skipped
+        if codec.skipped != turn.skipped:
+            turn.tear()
+            turn.skipped = codec.skipped
         if not turn.offer(reply):
             strays.append(reply)
-    return turn.complete() and not codec.pending and codec.skipped == skipped
+    return turn.complete() and not codec.pending and codec.skipped == turn.skipped

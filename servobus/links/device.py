@@ -103,6 +103,12 @@ def _denied(path: str) -> LinkDown:
     return PortDenied(f"{path} may not be opened by you, nor by its group ({group}): {advice}")
 
 
+def _walled_off(path: str) -> LinkDown:
+    """The file's own permissions do not say this, but the walls around a container or a service do."""
+    advice = f"start the container with `--device {path}`, or the service with `DeviceAllow={path}`"
+    return PortDenied(f"{path} is kept from this container or service: {advice}")
+
+
 def _gone(path: str) -> LinkDown:
     return PortMissing(f"{path} has no device behind it: plug the adapter in again")
 
@@ -113,7 +119,7 @@ def _no_port(path: str) -> LinkDown:
 
 REASONS: dict[int, Callable[[str], LinkDown]] = {
     errno.EACCES: _denied,
-    errno.EPERM: _denied,
+    errno.EPERM: _walled_off,
     errno.EBUSY: _busy,
     errno.EAGAIN: _busy,  # pyserial's lock
     errno.ENOENT: _gone,

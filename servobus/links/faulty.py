@@ -69,6 +69,7 @@ class FaultyEnd:
         self._node_of = node_of
         self._damages = {"wrong_id": rename, **DAMAGES}
         self._deliver: Callable[[bytes], None] = _nobody
+        self._late: dict[Hashable, deque[bytes]] = {}
         self._late_until: dict[Hashable, float] = {}
         self._pieces: deque[bytes] = deque()
         far.attach(self._heard)
@@ -91,13 +92,19 @@ class FaultyEnd:
         for name, damage in self._damages.items():
             if frame and self._strikes(name):
                 frame = damage(frame, self._rng)
-        now = self._loop.time()
-        due = max(now + delay, self._late_until.get(node, 0.0))
-        if due > now:
-            self._late_until[node] = due
-            self._loop.call_at(due, self._say, frame)
+        if delay or self._late.get(node):
+            self._say_late(node, frame, delay)
         else:
             self._say(frame)
+
+    def _say_late(self, node: Hashable, frame: bytes, delay: float) -> None:
+        """Behind what this node still has to say. It is the queue that keeps the order: a loop does not, between timers that
+        are due at the same moment."""
+        due = max(self._loop.time() + delay, self._late_until.get(node, 0.0))
+        self._late_until[node] = due
+        queue = self._late.setdefault(node, deque())
+        queue.append(frame)
+        self._loop.call_at(due, lambda: self._say(queue.popleft()))
 
     def _strikes(self, fault: str) -> bool:
         share: float = getattr(self._options, fault)

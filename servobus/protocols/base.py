@@ -187,7 +187,7 @@ class Calibration:
     unit_per_step: float
 
     def to_unit(self, raw: float) -> float:
-        return self.direction * (raw - self.zero) * self.unit_per_step
+        return self.direction * (raw - self.zero) * self.unit_per_step + 0.0  # never -0.0
 
     def to_raw(self, position: float) -> int:
         """Nearest step, ties to even."""
@@ -195,7 +195,7 @@ class Calibration:
 
     def rate_to_unit(self, steps: float) -> float:
         """Steps/s to unit/s, with the direction."""
-        return self.direction * steps * self.unit_per_step
+        return self.direction * steps * self.unit_per_step + 0.0
 
     def rate_to_raw(self, rate: float) -> float:
         """Unit/s to steps/s, with the direction, not rounded."""
@@ -383,4 +383,9 @@ class Device(Protocol):
 
 def is_number(value: object) -> bool:
     """A finite number that is no boolean."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer no float can hold
+        return False

@@ -156,7 +156,7 @@ def test_denied_to_everybody(tmp_path: Path) -> None:
     error = explain(str(port), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(error, PortDenied)
     assert f"nor by its group ({port.group()}): give it to group dialout by a udev rule" in str(error)
-    unseen = explain(str(tmp_path / "gone"), PermissionError(errno.EPERM, "Operation not permitted"))
+    unseen = explain(str(tmp_path / "gone"), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(unseen, PortDenied)
     assert "nor by its group (another group)" in str(unseen)
 
@@ -172,6 +172,7 @@ def test_denied_to_everybody(tmp_path: Path) -> None:
         (OSError(errno.ENODEV, "No such device"), PortMissing, "no device behind it"),
         (OSError(errno.ENXIO, "No such device or address"), PortMissing, "no device behind it"),
         (termios.error(errno.EIO, "Input/output error"), PortMissing, "no device behind it"),
+        (OSError(errno.EPERM, "Operation not permitted"), PortDenied, "start the container with `--device /dev/ttyUSB7`, or"),
         (OSError(errno.EINVAL, "Invalid argument"), PortMissing, "no serial port"),
         (serial.SerialException(errno.EWOULDBLOCK, "Could not exclusively lock port"), PortBusy, "is held by"),
         (ValueError("Invalid baud rate: -1"), LinkDown, "cannot be opened (Invalid baud rate: -1): unplug it"),

@@ -1,0 +1,5 @@
+"""python -m servobus."""
+
+from servobus.doors.cli import main
+
+main()

@@ -1,0 +1,227 @@
+"""What the commands share: where the config is, which buses to open, how to say things, and how to run."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import functools
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+import structlog
+from rich.console import Console
+from rich.table import Table
+
+from servobus.config import Config, load_config
+from servobus.errors import ConfigError
+from servobus.local import LocalRig, Trace, open_rig
+from servobus.protocols.base import State
+from servobus.protocols.table import PROTOCOLS
+from servobus.rig import full_name
+
+R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
+DEFAULT_CONFIG = "servobus.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What every command on servos takes."""
+
+    config: str | None
+    as_json: bool
+    trace: bool
+    dry_run: bool
+
+    def load(self) -> Config:
+        """The config; on simulated servos when nothing shall be sent. Raises ConfigError."""
+        if self.config is None and not Path(DEFAULT_CONFIG).exists():
+            raise ConfigError(f"no config: give -c CONFIG, set SERVOBUS_CONFIG, or make ./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)")
+        config = load_config(self.config or DEFAULT_CONFIG)
+        return simulated(config) if self.dry_run else config
+
+
+def servo_options(command: F) -> F:
+    """Adds the options and hands them over as one `options`."""
+
+    @click.option("-c", "--config", envvar="SERVOBUS_CONFIG", metavar="CONFIG", help="Bus config (YAML). Default: ./servobus.yaml.")
+    @click.option("--json", "as_json", is_flag=True, help="For machines: one JSON document on standard output.")
+    @click.option("--trace", is_flag=True, help="Print every frame, both ways and decoded, on standard error.")
+    @click.option("--dry-run", is_flag=True, help="Open no port: run on simulated servos and print what would be sent.")
+    @functools.wraps(command)
+    def wrapper(config: str | None, as_json: bool, trace: bool, dry_run: bool, **arguments: Any) -> Any:
+        return command(options=Options(config, as_json, trace, dry_run), **arguments)
+
+    return wrapper  # type: ignore[return-value]
+
+
+def simulated(config: Config) -> Config:
+    """The same servos, but none of them real."""
+    buses = {name: options.model_copy(update={"port": "sim:", "faults": None}) for name, options in config.buses.items()}
+    return replace(config, buses=buses)
+
+
+@asynccontextmanager
+async def opened(options: Options, names: Collection[str] = ()) -> AsyncIterator[LocalRig]:
+    """A rig with the buses of these servos, or with all. Raises UnknownName before a port is opened."""
+    config = options.load()
+    full = [full_name(config.names, name) for name in names]
+    buses = dict.fromkeys(config.names[name][0] for name in full)
+    if options.dry_run:
+        click.echo("dry run: on simulated servos, no port is opened", err=True)
+    async with open_rig(config, buses=list(buses), trace=tracer(config, options)) as rig:
+        yield rig
+
+
+def tracer(config: Config, options: Options) -> Trace | None:
+    """Prints frames in words. A dry run prints what would be sent, on standard output unless that is JSON."""
+    if not (options.trace or options.dry_run):
+        return None
+    codecs = {name: PROTOCOLS[bus.protocol].codec() for name, bus in config.buses.items()}
+    started: list[float] = []
+
+    def trace(bus: str, sent: bool, data: bytes, now: float) -> None:
+        if not started:
+            started.append(now)
+        if not sent and not options.trace:
+            return
+        codec = codecs[bus]
+        codec.reset()
+        codec.receive_data(data)
+        frames = []
+        while (reply := codec.next_reply()) is not None:
+            frames.append(reply.frame)
+        for frame in frames or [data]:
+            words = codec.describe(frame, sent=sent)
+            line = f"{now - started[0]:9.4f} {bus} {'>' if sent else '<'} {frame.hex(' ')}   {words}"
+            click.echo(line, err=options.trace or options.as_json)
+
+    return trace
+
+
+def run(main: Callable[[], Coroutine[Any, Any, R]], *, terminated: int = 128 + signal.SIGTERM) -> R:
+    """Run it on the fastest loop there is. Ctrl-C and SIGTERM end it in order, so that exit policies are applied; the status after
+    SIGTERM is `terminated`."""
+    with asyncio.Runner(loop_factory=loop_factory()) as runner:
+        return runner.run(_until_terminated(main, terminated))
+
+
+def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """uvloop where it is installed."""
+    with suppress(ImportError):
+        import uvloop
+
+        return uvloop.new_event_loop
+    return None
+
+
+async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: int) -> R:
+    task, loop = asyncio.current_task(), asyncio.get_running_loop()
+    assert task is not None
+    received: list[int] = []
+
+    def terminate() -> None:
+        if received:
+            os._exit(status)  # asked for a second time: at once
+        received.append(signal.SIGTERM)
+        task.cancel()
+
+    loop.add_signal_handler(signal.SIGTERM, terminate)
+    try:
+        return await main()
+    except asyncio.CancelledError:
+        if received:
+            raise SystemExit(status) from None
+        raise
+    finally:
+        loop.remove_signal_handler(signal.SIGTERM)
+
+
+def logs(level: int = logging.WARNING) -> None:
+    """To standard error: for people on a terminal, JSON otherwise."""
+    terminal = sys.stderr.isatty()
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=False,
+    )
+
+
+def emit(data: Any) -> None:
+    """JSON for machines."""
+    click.echo(json.dumps(data, default=_plain, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    return str(value)
+
+
+def table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
+    """Numbers right, words left."""
+    made = Table(title=title, box=None, pad_edge=False, header_style="bold")
+    kept = [[show(cell) for cell in row] for row in rows]
+    for index, column in enumerate(columns):
+        number = bool(kept) and all(_is_number(row[index]) for row in kept)
+        made.add_column(column, justify="right" if number else "left", overflow="fold")
+    for row in kept:
+        made.add_row(*row)
+    return made
+
+
+def show(value: object) -> str:
+    """A cell."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.2f}"
+    return ", ".join(map(str, value)) if isinstance(value, (tuple, list)) else str(value)
+
+
+def _is_number(text: str) -> bool:
+    return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
+
+
+def echo_table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console.width = 200  # nobody wraps a file
+    console.print(table(title, columns, rows), highlight=False)
+
+
+STATE_COLUMNS = ("servo", "position", "goal", "speed", "load %", "V", "°C", "A", "moving", "enabled", "health", "faults")
+
+
+def state_row(name: str, state: State) -> tuple[object, ...]:
+    """One servo as a row of `STATE_COLUMNS`."""
+    return (
+        name,
+        state.position,
+        state.goal,
+        state.speed,
+        state.load,
+        state.voltage,
+        state.temperature,
+        state.current,
+        state.moving,
+        state.enabled,
+        state.health,
+        state.faults or None,
+    )

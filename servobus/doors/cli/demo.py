@@ -1,0 +1,138 @@
+"""The main job, shown on embedded simulated lines: one caller per servo streams goals while feedback is polled."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import click
+
+from servobus.config import parse_config
+from servobus.doors.cli.common import echo_table, emit, logs, run
+from servobus.doors.cli.offline import loads_of
+from servobus.errors import ServobusError
+from servobus.local import LocalRig, open_rig
+from servobus.protocols.base import Outcome
+from servobus.rig import Servo
+
+GOAL_HZ = 100.0
+FEEDBACK_HZ = 50.0
+SWING = 30.0
+"""Degrees to either side."""
+PERIOD = 4.0
+"""Seconds of one swing."""
+CONFIG = f"""
+version: 1
+buses:
+  arm:
+    protocol: sms
+    port: "sim:"
+    baudrate: 1000000
+    poll: {{{{feedback: {FEEDBACK_HZ:g}}}}}
+    goal_rate: {GOAL_HZ:g}
+    servos:
+{{sts}}
+  base:
+    protocol: sms
+    port: "sim:"
+    baudrate: 115200
+    poll: {{{{feedback: {FEEDBACK_HZ:g}}}}}
+    goal_rate: {GOAL_HZ:g}
+    servos:
+{{sms}}
+"""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What the callers of one bus saw."""
+
+    outcomes: Counter[str] = field(default_factory=Counter)
+    errors: Counter[str] = field(default_factory=Counter)
+
+
+@click.command()
+@click.option("--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5, 3600), help="How long to stream.")
+@click.option("--json", "as_json", is_flag=True, help="For machines.")
+def demo(seconds: float, as_json: bool) -> int:
+    """Stream goals to ten simulated servos on two lines with real wire time, and print what the lines carried.
+
+    Six STS at 1 Mbaud and four SMS at 115200 baud; one caller per servo sends 100 goals a second, feedback is polled at 50 Hz.
+
+    Example: servobus demo --seconds 3
+    """
+    logs(logging.ERROR)
+    servos = {"sts": 6, "sms": 4}
+    lines = {model: "\n".join(f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}" for number in range(1, count + 1)) for model, count in servos.items()}
+    config = parse_config(CONFIG.format(**lines), "demo")
+    if not as_json:
+        for name, load in loads_of(config).items():
+            options = config.buses[name]
+            verdict = "carries that" if load.total <= 100 else "cannot carry all of that: goals are replaced by newer ones, polls are skipped"
+            click.echo(
+                f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each and {FEEDBACK_HZ:g} Hz feedback "
+                f"ask {load.total:.0f} % of the line; it {verdict}"
+            )
+
+    async def main() -> int:
+        async with open_rig(config) as rig:
+            await rig.enable()
+            before = rig.stats()
+            tallies = {name: Tally() for name in config.buses}
+            started = asyncio.get_running_loop().time()
+            await asyncio.gather(*(_caller(servo, tallies[rig.names[servo.name][0]], started, seconds) for servo in rig))
+            elapsed = asyncio.get_running_loop().time() - started
+            rows = {name: _row(rig, name, tally, before[name], elapsed) for name, tally in tallies.items()}
+            if as_json:
+                emit(rows)
+            else:
+                echo_table(None, ("bus", *next(iter(rows.values()))), [(name, *row.values()) for name, row in rows.items()])
+            return 1 if any(row["errors"] for row in rows.values()) else 0
+
+    return run(main)
+
+
+async def _caller(servo: Servo, tally: Tally, started: float, seconds: float) -> None:
+    """Goals on a fixed grid. A goal that is not through when the next is due is replaced by it, as in any streaming caller."""
+    loop = asyncio.get_running_loop()
+    pending: set[asyncio.Task[None]] = set()
+    for tick in range(int(seconds * GOAL_HZ)):
+        await asyncio.sleep(started + tick / GOAL_HZ - loop.time())
+        position = SWING * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD)
+        task = loop.create_task(_send(servo, position, tally))
+        pending.add(task)
+        task.add_done_callback(pending.discard)
+    await asyncio.gather(*pending)
+
+
+async def _send(servo: Servo, position: float, tally: Tally) -> None:
+    try:
+        outcome = await servo.move_to(position)
+    except ServobusError as error:
+        tally.errors[type(error).__name__] += 1
+    else:
+        tally.outcomes[outcome] += 1
+
+
+def _row(rig: LocalRig, name: str, tally: Tally, before: dict[str, Any], seconds: float) -> dict[str, Any]:
+    stats = rig.stats()[name]
+    goals = sum(tally.outcomes.values())
+    delivered = goals - tally.outcomes[Outcome.SUPERSEDED]
+    frames = stats["goal_turns"] - before["goal_turns"]  # a goal turn here is one frame: WRITE or SYNC WRITE
+    feedback = stats.get("polled", 0) - before.get("polled", 0)
+    servos = len(rig.config.buses[name].servos)
+    return {
+        "goals accepted": goals,
+        "goal frames": frames,
+        "goals/frame": round(delivered / frames, 2) if frames else 0.0,
+        "goals/s": round(goals / seconds, 1),
+        "feedback Hz": round(feedback / servos / seconds, 1),
+        "wire load %": stats["wire_load_percent"],
+        "turn p50 ms": stats["turn_ms"]["p50"],
+        "turn p99 ms": stats["turn_ms"]["p99"],
+        "errors": sum(tally.errors.values()),
+    }

@@ -1,0 +1,151 @@
+"""Commands that move or stop: move, enable, disable, stop, clear. No daemon runs, so each opens the port itself and leaves it again:
+what it enabled is then left as the servo's `on_exit` says."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import click
+
+from servobus.doors.cli.common import Options, echo_table, emit, logs, opened, run, servo_options
+from servobus.errors import LimitError, NotSupported
+from servobus.local import LocalRig
+
+NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
+
+
+@click.command()
+@click.argument("targets", metavar="NAME=POSITION...", nargs=-1, required=True)
+@click.option("--speed", type=float, help="Unit/s on the way.")
+@click.option("--duration", type=float, help="Seconds the way shall take, instead of a speed.")
+@click.option("--together", is_flag=True, help="All begin at the same moment, or none does.")
+@click.option("--confirm", is_flag=True, help="Every servo acknowledges before any moves.")
+@click.option("--timeout", default=10.0, show_default=True, type=click.FloatRange(min=0), help="Seconds to arrive within.")
+@servo_options
+def move(
+    options: Options, targets: tuple[str, ...], speed: float | None, duration: float | None, together: bool, confirm: bool, timeout: float
+) -> int:
+    """Enable servos, move them, wait until they stand, and leave them as their `on_exit` says.
+
+    Positions in each servo's unit.
+
+    Example: servobus move shoulder=10 elbow=-20 --speed 30
+    """
+    logs()
+    goals = dict(_target(text) for text in targets)
+
+    async def main() -> int:
+        async with opened(options, list(goals)) as rig:
+            await rig.enable(*goals)
+            await rig.move(goals, together=together, confirm=confirm, speed=speed, duration=duration)
+            states = await rig.settle(*goals, timeout=timeout)
+            if options.as_json:
+                emit({name: {"position": state.position} for name, state in states.items()})
+            else:
+                echo_table(None, ("servo", "position", "then"), [(name, state.position, _left(rig, name)) for name, state in states.items()])
+            return 0
+
+    return run(main)
+
+
+def _target(text: str) -> tuple[str, float]:
+    name, equals, position = text.rpartition("=")
+    if not (name and equals):
+        raise click.BadParameter(f"{text!r}: write NAME=POSITION", param_hint="NAME=POSITION")
+    try:
+        return name, float(position)
+    except ValueError:
+        raise LimitError(f"{text}: {position!r} is no number: nothing was sent") from None
+
+
+def _left(rig: LocalRig, name: str) -> str:
+    """What becomes of it when this command ends."""
+    bus, servo = rig.names[name]
+    policy = rig.config.buses[bus].servos[servo].on_exit
+    return {"hold": "holds", "limp": "goes limp", "park": "parks, then goes limp"}[policy] + " (on_exit)"
+
+
+@click.command()
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@servo_options
+def enable(options: Options, names: tuple[str, ...]) -> int:
+    """Energise servos where they stand: the present position becomes the goal, then torque goes on. All if none is named.
+
+    No daemon runs, so they are at once left as their `on_exit` says: with hold they stay energised.
+
+    Example: servobus enable elbow
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options, names) as rig:
+            await rig.enable(*names)
+            done = rig.full_names(names)
+            if options.as_json:
+                emit({name: {"enabled": True} for name in done})
+            else:
+                echo_table(None, ("servo", "state", "then"), [(name, "enabled", _left(rig, name)) for name in done])
+            return 0
+
+    return run(main)
+
+
+@click.command()
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@servo_options
+def disable(options: Options, names: tuple[str, ...]) -> int:
+    """Switch torque off, confirmed by reading back. All servos if none is named.
+
+    Example: servobus disable elbow
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options, names) as rig:
+            await rig.disable(*names)
+            done = rig.full_names(names)
+            if options.as_json:
+                emit({name: {"enabled": False} for name in done})
+            else:
+                echo_table(None, ("servo", "state"), [(name, "limp") for name in done])
+            return 0
+
+    return run(main)
+
+
+@click.command()
+@servo_options
+def stop(options: Options) -> int:
+    """E-stop: every servo of every bus stops as its `on_estop` says; what was limp stays limp. Tells what each confirmed.
+
+    Example: servobus stop
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options) as rig:
+            reports = await rig.stop()
+            click.echo(NOT_LATCHED, err=True)
+            if options.as_json:
+                emit(reports)
+            else:
+                rows = [(name, report.action, report.written, report.confirmed, report.detail or None) for name, report in reports.items()]
+                echo_table(None, ("servo", "action", "written", "confirmed", "detail"), rows)
+            return 0 if _all_confirmed([report.confirmed for report in reports.values()]) else 1
+
+    return run(main)
+
+
+def _all_confirmed(confirmed: Collection[bool]) -> bool:
+    return all(confirmed)
+
+
+@click.command()
+@servo_options
+def clear(options: Options) -> int:
+    """Release the e-stop that a daemon has latched. Moves nothing.
+
+    Example: servobus clear
+    """
+    options.load()
+    raise NotSupported("there is no e-stop to release: no daemon runs (`servobus run`), and without one nothing is latched")

@@ -1,0 +1,147 @@
+"""Commands that ask servos and write single registers: ping, read, write."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import click
+
+from servobus.doors.cli.common import STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, show, state_row
+from servobus.errors import ServobusError
+from servobus.local import LocalRig
+
+
+@click.command()
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@servo_options
+def ping(options: Options, names: tuple[str, ...]) -> int:
+    """Ask servos whether they are there, and for their health byte. All of them if none is named.
+
+    Example: servobus ping shoulder elbow
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options, names) as rig:
+            answers = await _each(rig, names, rig.ping)
+            failed = {name: str(answer) for name, answer in answers.items() if isinstance(answer, ServobusError)}
+            if options.as_json:
+                emit({name: {"error": failed[name]} if name in failed else {"status": answer} for name, answer in answers.items()})
+            else:
+                echo_table(None, ("servo", "answer"), [(name, failed.get(name) or _health(rig, name)) for name in answers])
+            return 1 if failed else 0
+
+    return run(main)
+
+
+def _health(rig: LocalRig, name: str) -> str:
+    faults = rig.snapshot()[name].faults
+    return f"there, but {', '.join(faults)}" if faults else "there"
+
+
+async def _each(rig: LocalRig, names: tuple[str, ...], verb: Callable[[str], Awaitable[Any]]) -> dict[str, Any]:
+    """The answer or the error of each servo."""
+    answers: dict[str, Any] = {}
+    for name in rig.full_names(names):
+        try:
+            answers[name] = await verb(name)
+        except ServobusError as error:
+            answers[name] = error
+    return answers
+
+
+@click.command()
+@click.argument("name", required=False)
+@click.argument("register", metavar="[REGISTER|ADDR:LEN]", required=False)
+@click.option("--raw", is_flag=True, help="The integer in the register instead of the physical value.")
+@servo_options
+def read(options: Options, name: str | None, register: str | None, raw: bool) -> int:
+    """Read the state of all servos, the state of one, or one register of one.
+
+    Positions in the servo's unit, speed in unit/s, load in percent, V, A, degrees Celsius. A register goes by name or alias
+    (temperature, present_position), or as ADDR:LEN for the bytes themselves.
+
+    Example: servobus read elbow temperature
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options, [name] if name else []) as rig:
+            if name and register:
+                return await _read_register(rig, options, rig.full_name(name), register, raw)
+            return await _read_states(rig, options, (name,) if name else ())
+
+    return run(main)
+
+
+async def _read_register(rig: LocalRig, options: Options, name: str, register: str, raw: bool) -> int:
+    value = await rig.read_register(name, register, raw=raw)
+    if options.as_json:
+        emit({name: {register: value}})
+    else:
+        click.echo(" ".join(f"{byte:02X}" for byte in value) if isinstance(value, list) else show(value))
+    return 0
+
+
+async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) -> int:
+    answers = await _each(rig, names, rig.read)
+    failed = {name: answer for name, answer in answers.items() if isinstance(answer, ServobusError)}
+    if options.as_json:
+        emit({name: {"error": str(answer)} if name in failed else answer for name, answer in answers.items()})
+        return 1 if failed else 0
+    rows = [state_row(name, state) for name, state in answers.items() if name not in failed]
+    if rows:
+        echo_table(None, STATE_COLUMNS, rows)
+    for error in failed.values():
+        click.echo(f"servobus: {error}", err=True)
+    return 1 if failed else 0
+
+
+@click.command()
+@click.argument("name")
+@click.argument("assignments", metavar="REGISTER=VALUE...", nargs=-1, required=True)
+@click.option("--raw", is_flag=True, help="VALUE is the integer in the register instead of the physical value.")
+@click.option("--persist", is_flag=True, help="Allow EEPROM registers: they are unlocked, written, read back and locked again.")
+@servo_options
+def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, persist: bool) -> int:
+    """Write registers of one servo, and read back what they hold then.
+
+    Goals, torque and lock are not written by hand: use move, enable and disable.
+
+    Example: servobus write elbow torque_limit=60
+    """
+    logs()
+    wanted = dict(_assignment(text) for text in assignments)
+
+    async def main() -> int:
+        async with opened(options, [name]) as rig:
+            full = rig.full_name(name)
+            found = {
+                register: await rig.write_register(full, register, value, raw=raw, persist=persist) for register, value in wanted.items()
+            }
+            if options.as_json:
+                emit({full: found})
+            else:
+                for register, value in found.items():
+                    click.echo(f"{full} {register} = {show(value)}")
+            return 0
+
+    return run(main)
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    register, equals, value = text.partition("=")
+    if not (register and equals and value):
+        raise click.BadParameter(f"{text!r}: write REGISTER=VALUE", param_hint="REGISTER=VALUE")
+    return register, number_or_word(value)
+
+
+def number_or_word(text: str) -> int | float | str:
+    """A number as people write it, hexadecimal too; else the word."""
+    for kind in (lambda value: int(value, 0), float):
+        try:
+            return kind(text)  # type: ignore[no-any-return]
+        except ValueError:
+            continue
+    return text

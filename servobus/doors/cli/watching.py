@@ -1,0 +1,90 @@
+"""Commands that look on: monitor, stats."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.live import Live
+
+from servobus.doors.cli.common import STATE_COLUMNS, Options, emit, echo_table, logs, opened, run, servo_options, state_row, table
+from servobus.local import LocalRig
+from servobus.rig import Snapshot
+
+MOST_HZ = 50.0
+
+
+@click.command()
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--hz", default=10.0, show_default=True, type=click.FloatRange(0.1, MOST_HZ), help="Pictures per second.")
+@click.option("--count", type=click.IntRange(min=1), help="Stop after so many.")
+@servo_options
+def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None) -> int:
+    """Show what the servos do, live, until Ctrl-C. Servos that the config does not poll are read at --hz.
+
+    On a terminal a table; otherwise, and with --json, one JSON line a picture.
+
+    Example: servobus monitor --hz 5
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options, names) as rig:
+            shown = rig.full_names(names)
+            if options.as_json or not sys.stdout.isatty():
+                await _pictures(rig, shown, hz, count, lambda snapshot: emit(snapshot))
+            else:
+                with Live(console=Console(), auto_refresh=False, screen=False) as live:
+                    await _pictures(rig, shown, hz, count, lambda snapshot: live.update(_picture(snapshot), refresh=True))
+            return 0
+
+    return run(main)
+
+
+def _picture(snapshot: Snapshot) -> Any:
+    return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()])
+
+
+async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, show: Any) -> None:
+    unpolled = [name for name in names if not rig.config.buses[rig.names[name][0]].poll.rates()]
+    taken = 0
+    async for snapshot in rig.watch(hz):
+        if unpolled:
+            await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
+            snapshot = rig.snapshot()
+        show({name: snapshot[name] for name in names})
+        taken += 1
+        if taken == count:
+            return
+
+
+@click.command()
+@click.option("--seconds", default=2.0, show_default=True, type=click.FloatRange(0.1, 3600), help="How long to count.")
+@servo_options
+def stats(options: Options, seconds: float) -> int:
+    """Poll as the config says for a while, and tell what the lines carried and how long turns took.
+
+    Example: servobus stats --seconds 10
+    """
+    logs()
+
+    async def main() -> int:
+        async with opened(options) as rig:
+            await asyncio.sleep(seconds)
+            found = rig.stats()
+            if options.as_json:
+                emit(found)
+                return 0
+            for bus, counts in found.items():
+                rows = [(name, value) for name, value in counts.items() if not isinstance(value, dict)]
+                turn = counts["turn_ms"]
+                rows.append(("turn ms p50 / p99 / max", f"{turn['p50']} / {turn['p99']} / {turn['max']}"))
+                echo_table(bus, ("counter", "value"), rows)
+                nodes = [(node, *entry.values()) for node, entry in counts["nodes"].items()]
+                echo_table(None, ("id", "health", "misses", "deadline ms"), nodes)
+            return 0
+
+    return run(main)

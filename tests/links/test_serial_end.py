@@ -1,0 +1,142 @@
+"""Serial links with full buffers, leaving, and being left; over real PTYs."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable
+
+import pytest
+
+from servobus.errors import LinkDown
+from servobus.links.serial import MOST_UNSENT, DirectTransport, SerialLink
+from tests.links.ear import Ear, on_each_loop
+from tests.links.pty import Pty, plugged
+
+
+async def filled(pty: Pty, ear: Ear) -> tuple[DirectTransport, bytes]:
+    """A transport whose kernel buffer is full, and all that it was given so far."""
+    transport = await SerialLink(pty.path, 1_000_000).connect(ear)
+    said = b""
+    while not transport.get_write_buffer_size():
+        chunk = bytes(at & 0xFF for at in range(len(said), len(said) + 1021))
+        transport.write(chunk)
+        said += chunk
+    return transport, said
+
+
+@on_each_loop
+async def test_what_finds_no_room_goes_later() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, said = await filled(pty, ear)
+        transport.write(b"the end")
+        assert await pty.hear(len(said) + 7) == said + b"the end"
+        assert transport.get_write_buffer_size() == 0
+        transport.write(b"at once")
+        assert await pty.hear(7) == b"at once"
+        transport.abort()
+        assert await ear.gone() is None
+
+
+async def test_what_waits_for_room_is_bounded() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.write(bytes(MOST_UNSENT - transport.get_write_buffer_size()))
+        assert not transport.is_closing()
+        transport.write(b"x")
+        assert transport.is_closing()
+        error = await ear.gone()
+        assert isinstance(error, LinkDown)
+        assert "takes no more bytes" in str(error)
+
+
+@on_each_loop
+async def test_who_closes_is_heard_to_the_end() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport, said = await filled(pty, ear)
+        transport.close()
+        transport.write(b"too late")
+        assert transport.is_closing()
+        assert await pty.hear(len(said)) == said
+        assert await ear.gone() is None
+        assert pty.heard() == b""
+
+
+@on_each_loop
+async def test_who_aborts_waits_for_nothing() -> None:
+    """The other side takes nothing, and never will."""
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.close()
+        transport.abort()
+        transport.abort()
+        assert await ear.gone() is None
+        transport.close()
+        transport.abort()
+        transport.set_baudrate(9_600)
+        assert await ear.gone() is None
+
+
+@on_each_loop
+async def test_unplugged() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.unplug()
+        error = await ear.gone()
+        assert isinstance(error, LinkDown)
+        assert str(error).startswith(f"{pty.path} was unplugged, or its other end closed: it is opened again when it is back")
+        transport.write(b"nobody")
+        assert (transport.is_closing(), ear.lost) == (True, [error])
+
+
+@pytest.mark.parametrize("verb", ["write", "look", "set_baudrate"])
+async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
+    """Reported once, though the loop finds it out as well; and not from within the call."""
+    ear = Ear()
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        pty.unplug()
+        calls: dict[str, Callable[[], object]] = {
+            "write": lambda: transport.write(b"x"),
+            "look": transport.look,
+            "set_baudrate": lambda: transport.set_baudrate(9_600),
+        }
+        calls[verb]()
+        assert (transport.is_closing(), ear.lost) == (True, [])
+        assert isinstance(await ear.gone(), LinkDown)
+
+
+@on_each_loop
+async def test_unplugged_with_a_full_buffer() -> None:
+    ear = Ear()
+    with plugged() as pty:
+        await filled(pty, ear)
+        pty.unplug()
+        assert isinstance(await ear.gone(), LinkDown)
+
+
+@on_each_loop
+async def test_unplugged_while_closing() -> None:
+    """Whoever was leaving anyway has left."""
+    ear = Ear()
+    with plugged() as pty:
+        transport, _ = await filled(pty, ear)
+        transport.close()
+        pty.unplug()
+        assert await ear.gone() is None
+
+
+async def test_the_port_is_free_when_the_loss_was_told() -> None:
+    """Also for the next user, who finds it open for everybody."""
+    with plugged() as pty:
+        for leave in ("close", "abort"):
+            ear = Ear()
+            transport = await SerialLink(pty.path, 115_200).connect(ear)
+            getattr(transport, leave)()
+            assert await ear.gone() is None
+            fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(pty.slave, fcntl.LOCK_UN)
