@@ -21,7 +21,7 @@ from servobus.errors import (
     ServobusError,
     UnknownName,
 )
-from servobus.local import open_rig as open  # noqa: A004 - `servobus.open` reads like the builtin because it is meant like it
+from servobus.local import open_rig as open
 from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Rig, Servo, Snapshot
 

@@ -20,7 +20,9 @@ MOST = 20
 EXPECTED = {
     "Input should be ": "expected ",
     "Value error, ": "",
-    "String should match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'": "expected a name of letters, digits, . _ - that begins with a letter or digit",
+    "String should match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'": (
+        "expected a name of letters, digits, . _ - that begins with a letter or digit"
+    ),
 }
 """pydantic's words -> ours."""
 
@@ -92,10 +94,10 @@ class Complaints:
 
 
 RULES: dict[str, Callable[[Complaints, type[BaseModel], KeyPath, KeyPath], None]] = {
-    "extra_forbidden": Complaints._unknown_key,  # noqa: SLF001
-    "missing": Complaints._missing_key,  # noqa: SLF001
-    "model_type": Complaints._no_section,  # noqa: SLF001
-    "dict_type": Complaints._no_section,  # noqa: SLF001
+    "extra_forbidden": Complaints._unknown_key,
+    "missing": Complaints._missing_key,
+    "model_type": Complaints._no_section,
+    "dict_type": Complaints._no_section,
 }
 
 

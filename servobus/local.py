@@ -59,7 +59,11 @@ class LocalRig(Rig):
 
     def _add(self, name: str, options: BusOptions) -> None:
         entry, models = PROTOCOLS[options.protocol], self.config.models[name]
-        link = simulated_link(options, models) if options.port.startswith("sim:") else open_link(options.port, options.baudrate, rs485=options.rs485)
+        link = (
+            simulated_link(options, models)
+            if options.port.startswith("sim:")
+            else open_link(options.port, options.baudrate, rs485=options.rs485)
+        )
         driver = entry.driver(options, models)
         self.links[name] = link
         self.buses[name] = BusService(name, options, driver, entry.codec(), link.traits, self._event)
@@ -80,6 +84,7 @@ class LocalRig(Rig):
         """Open the line, and again whenever it is gone. Ends by being cancelled."""
         bus, link = self.buses[name], self.links[name]
         while True:
+            bus.line.traits = link.traits  # what the port is may have changed while it was away
             try:
                 await link.connect(bus.master)
             except LinkDown as error:
@@ -114,8 +119,10 @@ class LocalRig(Rig):
                 for servo, entry in report.items():
                     if not entry.confirmed:
                         self._event("exit_unconfirmed", bus=bus, servo=servo, action=entry.action, detail=entry.detail)
-        for service in self.buses.values():
-            service.master.close()
+
+    async def close(self) -> None:
+        """Every line, once nobody opens them again."""
+        await asyncio.gather(*(bus.master.close() for bus in self.buses.values()))
         for link in self.links.values():
             if isinstance(link, SimLink):
                 link.close()
@@ -149,7 +156,9 @@ class LocalRig(Rig):
             task = asyncio.create_task(self._park(bus, servo))
             self._parking.add(task)
             task.add_done_callback(self._parking.discard)
-        return {f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()}
+        return {
+            f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
+        }
 
     async def clear(self) -> None:
         if self._parking:
@@ -278,8 +287,8 @@ def _raise_failures(results: Mapping[str, Any]) -> None:
 async def open_rig(
     config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False, trace: Trace | None = None
 ) -> AsyncIterator[LocalRig]:
-    """This process owns the ports of `config` (a path, or a loaded Config) until the context ends; then each servo enabled here is
-    left as its `on_exit` says. `buses`: only these. `degraded`: ports that cannot be opened are waited for instead of raising.
+    """This process owns the ports of `config` (a path, or a loaded Config) until the context ends; then each servo enabled here
+    is left as its `on_exit` says. `buses`: only these. `degraded`: ports that cannot be opened are waited for instead of raising.
     `trace` is called with every piece of bytes on the wire, both ways.
     Raises ConfigError, PortMissing, PortBusy, PortDenied, LinkDown."""
     rig = LocalRig(config if isinstance(config, Config) else load_config(config), buses, trace)
@@ -295,5 +304,7 @@ async def open_rig(
         with anyio.CancelScope(shield=True):
             await rig.leave()
         keepers.cancel_scope.cancel()
+    with anyio.CancelScope(shield=True):
+        await rig.close()
     if failure is not None:
         raise failure

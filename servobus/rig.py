@@ -1,7 +1,8 @@
 """Rig and Servo: the interface of every door and every app, the same in this process and through a daemon.
 
-Names: `rig["arm/elbow"]` always works, `rig["elbow"]` where it is unique. Positions are in the servo's unit (deg unless its model or
-config says otherwise), speeds in unit/s, times in seconds. Every verb may raise LinkDown, ReplyTimeout, UnknownName and Overloaded.
+Names: `rig["arm/elbow"]` always works, `rig["elbow"]` where it is unique. Positions are in the servo's unit (deg
+unless its model or config says otherwise), speeds in unit/s, times in seconds. Every verb may raise LinkDown,
+ReplyTimeout, UnknownName and Overloaded.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Servo:
         return await self.rig.send(self.name, Goal("velocity", velocity, acceleration=acceleration, effort=effort))
 
     async def settle(self, *, tolerance: float | None = None, timeout: float = 10.0) -> State:
-        """Wait until it stands at its goal; `tolerance` in its unit. Raises DeviceError with where it stands after `timeout` s."""
+        """Wait until it stands at its goal; `tolerance` in its unit. Raises DeviceError with its place after `timeout` s."""
         return (await self.rig.settle(self.name, tolerance=tolerance, timeout=timeout))[self.name]
 
     async def enable(self) -> None:
@@ -144,8 +145,9 @@ class Rig(ABC):
         duration: float | None = None,
         deadline: float | None = None,
     ) -> dict[str, Outcome]:
-        """Positions for several servos. `together`: those of one bus start at the same moment; `confirm`: each acknowledged before
-        any moves. All are checked before a byte is sent. Raises PartialFailure with the outcome of each, and what `move_to` raises.
+        """Positions for several servos. `together`: those of one bus start at the same moment; `confirm`: each acknowledged
+        before any moves. All are checked before a byte is sent. Raises PartialFailure with the outcome of each, and what
+        `move_to` raises.
         """
         goals = {name: Goal("position", value, speed, duration, deadline=deadline) for name, value in positions.items()}
         return await self.send_all(goals, together=together, confirm=confirm)

@@ -14,12 +14,18 @@ from servobus.protocols.sms.device import SmsDevice
 from servobus.sim.build import SimLink, far_end, simulated_line
 from servobus.sim.pty import SimPty
 
-STS = {1: "s1: {id: 1, model: sts, limits: [-90, 90]}", 2: "s2: {id: 2, model: sts}", 3: "s3: {id: 3, model: sts, on_estop: limp}"}
+STS = {
+    1: "s1: {id: 1, model: sts, limits: [-90, 90]}",
+    2: "s2: {id: 2, model: sts}",
+    3: "s3: {id: 3, model: sts, on_estop: limp}",
+}
 
 
 def config(*servos: str, port: str = "sim:", **keys: Any) -> Config:
     """One bus `arm` at 1 Mbaud. `servos`: lines of YAML; `keys`: more keys of the bus, in YAML flow style."""
-    lines = [f"    {key}: {value}" for key, value in {"protocol": "sms", "port": f"{port!r}", "baudrate": 1000000, **keys}.items()]
+    lines = [
+        f"    {key}: {value}" for key, value in {"protocol": "sms", "port": f"{port!r}", "baudrate": 1000000, **keys}.items()
+    ]
     servo_lines = [f"      {servo}" for servo in servos or STS.values()]
     return parse_config("\n".join(["version: 1", "buses:", "  arm:", *lines, "    servos:", *servo_lines, ""]), "test", Path())
 

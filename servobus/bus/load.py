@@ -1,7 +1,7 @@
 """What the rates of a config ask of its line, before it is opened. Pure.
 
-Counted is the time a turn holds the line: its bytes, and for each answer the pause before it. The driver says what the frames are,
-so nothing here knows a protocol.
+Counted is the time a turn holds the line: its bytes, and for each answer the pause before it. The driver says what
+the frames are, so nothing here knows a protocol.
 """
 
 from __future__ import annotations

@@ -22,6 +22,8 @@ from servobus.links.base import Transport
 from servobus.protocols.base import Codec, Reply, Request
 from servobus.timerfd import FineTimer, clock_of
 
+CLOSE_TIMEOUT = 0.5
+"""Seconds for the last bytes to leave."""
 SECOND_LOOK = 0.001
 """For links that cannot be looked at: one more pass of the loop before a deadline is declared missed."""
 
@@ -94,10 +96,16 @@ class BusMaster(asyncio.Protocol):
         """Until the line is gone."""
         await asyncio.shield(self._closed)
 
-    def close(self) -> None:
-        """Leave the line for good; everything that waits ends with LinkDown."""
-        if self._transport is not None:
-            self._transport.abort()
+    async def close(self) -> None:
+        """Leave the line for good, when what was said has left it; everything that waits ends with LinkDown."""
+        transport = self._transport
+        if transport is not None:
+            transport.close()
+            try:
+                async with asyncio.timeout(CLOSE_TIMEOUT):
+                    await self.wait_closed()
+            except TimeoutError:
+                transport.abort()
         self._wake.close()
 
     # The line

@@ -176,7 +176,7 @@ class Motion:
             await asyncio.sleep(SETTLE_PERIOD)
 
     async def park(self, servo: str) -> StopReport:
-        """To the park pose within `park_timeout`, then limp, even if it does not get there. Not refused by the e-stop it serves."""
+        """To the park pose within `park_timeout`, then limp, even if it does not get there. The e-stop it serves lets it pass."""
         options = self._bus.records[servo].options
         detail = ""
         try:

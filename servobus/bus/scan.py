@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from typing import TYPE_CHECKING
 
 from servobus.errors import DeviceError, NotSupported, ReplyTimeout
@@ -14,7 +14,9 @@ Hit = tuple[int, int, str | None, str | None, str | None, str]
 """Id, baud rate, model, product, firmware, note."""
 
 
-async def scan(bus: BusService, baudrates: Sequence[int], ids: Sequence[int]) -> AsyncIterator[tuple[int, int, Hit | None]]:
+async def scan(
+    bus: BusService, baudrates: Sequence[int], ids: Sequence[int]
+) -> AsyncGenerator[tuple[int, int, Hit | None], None]:
     """Yields (asked so far, in all, what was found). The bus's own rate is restored whatever happens. Raises NotSupported,
     LeaseHeld, LinkDown."""
     own = bus.options.baudrate

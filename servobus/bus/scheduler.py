@@ -129,6 +129,7 @@ class Scheduler:
         for lane, take in self._upwards:
             if self._owed[lane] and (job := take(now)) is not None:
                 return self._served(lane, job)
+        self._owed = [False] * len(self._lanes)  # nobody waits, so nobody is owed anything
         return None
 
     def _served(self, lane: int, job: Job) -> Job:

@@ -45,17 +45,29 @@ def explain(path: str, error: Exception) -> LinkDown:
 
 
 def find_holder(path: str) -> tuple[int, str] | None:
-    """The process that has this device open, and its name, as far as this user may see; another one rather than this one."""
+    """The process that has locked this device, or else has it open, and its name, as far as this user may see; another one rather
+    than this one."""
     try:
         wanted = os.stat(path)
     except OSError:
         return None
     own = os.getpid()
+    locked = _locked_by(wanted)
     processes = [int(folder.name) for folder in Path("/proc").glob("[0-9]*")]
-    for pid in sorted(processes, key=lambda pid: (pid == own, pid)):
+    for pid in sorted(processes, key=lambda pid: (pid not in locked, pid == own, pid)):
         if any(os.path.samestat(wanted, found) for found in _open_files(pid)):
             return pid, _name(pid)
     return None
+
+
+def _locked_by(wanted: os.stat_result) -> set[int]:
+    """Processes with a lock on this file: `1: FLOCK ADVISORY WRITE 4711 00:1c:3 0 EOF`, the third to last its device and inode."""
+    place = f"{os.major(wanted.st_dev):02x}:{os.minor(wanted.st_dev):02x}:{wanted.st_ino}"
+    try:
+        lines = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+    except OSError:
+        return set()
+    return {int(words[-4]) for words in lines if len(words) >= 8 and words[-3] == place}
 
 
 def _open_files(pid: int) -> Iterator[os.stat_result]:

@@ -26,7 +26,7 @@ class Puppet:
         self.heard: list[bytes] = []
         self.baudrates: list[int] = []
         self._loop = asyncio.get_running_loop()
-        self._deliver: Callable[[bytes], None] = bytes
+        self._deliver: Callable[[bytes], object] = bytes
         self._until: dict[int, float] = {}
         """A servo and its UART are a queue: no answer of one overtakes another."""
 
@@ -71,7 +71,7 @@ class Events(list[str]):
 
 @asynccontextmanager
 async def puppet_bus(
-    *servos: str, traits: LineTraits | None = None, started: bool = True, **keys: object
+    *servos: str, traits: LineTraits | None = None, started: bool = True, **keys: str
 ) -> AsyncIterator[tuple[BusService, Puppet, MemoryLink, Events]]:
     """A bus of two STS, introduced unless `started` is False."""
     setup = config(*(servos or ("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts}")), **keys)
@@ -86,5 +86,4 @@ async def puppet_bus(
     try:
         yield bus, puppet, link, events
     finally:
-        bus.master.close()
-        await asyncio.sleep(0)
+        await bus.master.close()

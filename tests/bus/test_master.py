@@ -118,6 +118,7 @@ async def test_the_request_heard_back_is_never_its_own_answer() -> None:
 @virtual
 async def test_auto_hears_whether_the_line_echoes(echoes: bool, found: str) -> None:
     async with puppet_bus(echo="auto", started=False) as (bus, puppet, _, _):
+
         def script(frame: bytes) -> Answers | None:
             if frame[2] not in (1, 2):
                 return [(0.0005, frame)] if echoes else []
@@ -178,7 +179,7 @@ async def test_an_e_stop_goes_between_the_frames_of_a_plan() -> None:
 
 @virtual
 async def test_a_reading_plan_goes_on_after_the_e_stop() -> None:
-    async with puppet_bus() as (bus, puppet, _, _):
+    async with puppet_bus() as (bus, _, _, _):
         asking = asyncio.create_task(bus.identify("s1"))
         await asyncio.sleep(0.0015)
         await bus.motion.stop()

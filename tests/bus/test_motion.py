@@ -1,4 +1,6 @@
-"""What moves on one bus, where the rig's tests cannot reach: callers that leave, servos that fail while they are enabled or parked."""
+"""What moves on one bus, where the rig's tests cannot reach: callers that leave, servos that fail while they are
+enabled or parked.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ async def test_enable_asks_who_it_is_first_if_that_is_not_known() -> None:
 
 @virtual
 async def test_a_servo_that_does_not_take_its_goal_stays_disabled() -> None:
-    async with puppet_bus() as (bus, puppet, _, _):
+    async with puppet_bus() as (bus, _, _, _):
         with pytest.raises(DeviceError, match="arm/s1"):
             await bus.motion.enable("s1")  # a puppet's torque reads 0 whatever is written
         assert not bus.records["s1"].enabled

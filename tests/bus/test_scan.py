@@ -29,7 +29,7 @@ async def test_every_id_at_every_rate() -> None:
 
 @virtual
 async def test_a_scan_that_is_left_gives_the_line_back_at_its_own_rate() -> None:
-    async with puppet_bus() as (bus, puppet, _, _):
+    async with puppet_bus() as (bus, _, _, _):
         own = bus.options.baudrate
         async with aclosing(scan(bus, [500_000, own], range(8))) as steps:
             await anext(steps)

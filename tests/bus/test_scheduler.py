@@ -8,12 +8,21 @@ from typing import Any
 
 import pytest
 
-from servobus.bus.health import FIRST_DEADLINE
-from servobus.bus.queue import Callback, Job
+from servobus.bus.health import FIRST_DEADLINE, GREATEST_BACKOFF
+from servobus.bus.queue import Job
 from servobus.bus.scheduler import POLL_PATIENCE, PollTimer
-from servobus.errors import ActionWithheld, EStopped, GoalExpired, LinkDown, NotEnabled, NotSupported, Overloaded, ReplyTimeout
-from servobus.protocols.base import Outcome, run_plan
-from tests.bus.toy import ANSWER, READ, Bench, Sink, group_read, poll, read, shout, ticket
+from servobus.errors import (
+    ActionWithheld,
+    EStopped,
+    GoalExpired,
+    NotEnabled,
+    NotSupported,
+    Overloaded,
+    ReplyTimeout,
+    ServobusError,
+)
+from servobus.protocols.base import Outcome, Plan, run_plan
+from tests.bus.toy import ANSWER, READ, Bench, Sink, poll, read, ticket
 
 Ended = list[tuple[str, Any]]
 
@@ -22,24 +31,535 @@ def job(node: int, *, expires: float = 10.0, motion: bool = False, urgent: bool 
     return Job(Sink(), expires, request=read(node), motion=motion, urgent=urgent, session=session)
 
 
-def sink(of: Job) -> Sink:
+def results(of: Job) -> list[Any]:
     assert isinstance(of.sink, Sink)
-    return of.sink
+    return of.sink.results
 
 
-def kind(bench: Bench, taken: Job | None) -> str:
+def stop_job() -> Job:
+    def plan() -> Plan[str]:
+        yield read(1)
+        return "stopped"
+
+    return Job(Sink(), 10.0, plan=plan(), node=1)
+
+
+def kind(taken: Job | None) -> str:
     if taken is None:
         return "-"
     if taken.recovery:
         return "probe"
     if taken.plan is not None:
         return "goal" if taken.motion else "estop"
-    return "poll" if taken.sink.done or isinstance(taken.sink, Callback) and taken.tries == 1 else "request"
+    return "request" if isinstance(taken.sink, Sink) else "poll"
 
 
-def finish(taken: Job) -> Any:
-    """Let a plan run to its end, as a line that answers would."""
+def finish(taken: Job | None) -> None:
+    """Let its plan run to its end, as a line that answers would."""
+    assert taken is not None
     assert taken.plan is not None
-    value = run_plan(taken.plan, lambda request: None)
-    taken.succeed(value)
-    return value
+    taken.succeed(run_plan(taken.plan, lambda _: None))
+
+
+def estopped(_: str) -> ServobusError:
+    return EStopped("stop")
+
+
+def disabled(servo: str) -> ServobusError:
+    return NotEnabled("disabled", servo=servo)
+
+
+class Flood:
+    """A bench where each class named has always something to send."""
+
+    def __init__(self, *classes: str) -> None:
+        self.classes = classes
+        self.bench = Bench(1, 2, 3)
+        self.now = 0.0
+        self._ended: Ended = []
+        if "poll" in classes:
+            self.bench.scheduler.set_polls([poll("feedback", 1000, 1, 2)], 0.0)
+        if "probe" in classes:
+            self.bench.health.missed(self.bench.node(3), READ, 0.0, 0.0)
+
+    def turn(self) -> Job | None:
+        self.now += 0.001
+        if "goal" in self.classes:
+            self.bench.coalescer.put(ticket(1, self._ended, expires=self.now + 1))
+        if "request" in self.classes and len(self.bench.scheduler.requests) < 4:
+            self.bench.scheduler.submit(job(2, expires=self.now + 1), self.now)
+        return self.bench.scheduler.next_turn(self.now)
+
+    def kinds(self, count: int) -> list[str]:
+        return [kind(self.turn()) for _ in range(count)]
+
+
+# The order of the classes
+
+
+def test_the_classes_go_in_their_order() -> None:
+    bench, ended = Bench(1, 2, 3), Ended()
+    bench.health.missed(bench.node(3), READ, 0.0, 0.0)
+    bench.scheduler.set_polls([poll("feedback", 50, 1)], 0.0)
+    bench.scheduler.submit(job(2), 0.0)
+    bench.coalescer.put(ticket(1, ended))
+    bench.scheduler.estop.append(stop_job())
+    assert [kind(bench.scheduler.next_turn(0.0)) for _ in range(5)] == ["estop", "goal", "request", "poll", "probe"]
+
+
+@pytest.mark.parametrize(
+    ("classes", "pattern"),
+    [
+        (("goal", "request", "poll", "probe"), "goal request goal poll goal request goal probe"),
+        (("goal", "request", "poll"), "goal request goal poll"),
+        (("goal", "poll", "probe"), "goal poll goal probe"),
+        (("goal", "request"), "goal request"),
+        (("goal", "probe"), "goal probe"),
+        (("request", "poll", "probe"), "request poll request probe"),
+        (("request", "poll"), "request poll"),
+        (("poll", "probe"), "poll probe"),
+        (("goal",), "goal"),
+        (("request",), "request"),
+    ],
+)
+def test_a_flood_of_one_class_leaves_every_lower_one_its_share(classes: tuple[str, ...], pattern: str) -> None:
+    expected = pattern.split()
+    assert Flood(*classes).kinds(5 * len(expected)) == 5 * expected
+
+
+def test_what_comes_late_into_a_flood_of_goals_goes_next() -> None:
+    flood = Flood("goal")
+    assert set(flood.kinds(10)) == {"goal"}
+    flood.classes = ("goal", "request")
+    assert flood.kinds(4) == ["request", "goal", "request", "goal"]
+
+
+def test_after_a_pause_nobody_is_owed_a_turn() -> None:
+    flood = Flood("goal")
+    flood.kinds(2)
+    flood.classes = ()
+    assert flood.kinds(1) == ["-"]
+    flood.classes = ("goal", "request")
+    assert flood.kinds(2) == ["goal", "request"]
+
+
+def test_an_estop_is_never_owed_to_anybody() -> None:
+    flood = Flood("goal", "request")
+    for _ in range(5):
+        flood.bench.scheduler.estop.append(stop_job())
+    assert flood.kinds(7) == ["estop"] * 5 + ["goal", "request"]
+
+
+# Polls
+
+
+def test_polls_stand_on_a_fixed_grid_however_late_they_are() -> None:
+    timer = PollTimer(poll("feedback", 10, 1), due=1.0)
+    timer.advance(1.0)
+    assert timer.due == pytest.approx(1.1)
+    assert timer.missed == 0
+    timer.advance(1.15)
+    assert timer.due == pytest.approx(1.2), "late, and the next is on the grid"
+    assert timer.missed == 0
+    timer.advance(1.75)
+    assert timer.due == pytest.approx(1.8), "1.3 to 1.7 passed without a poll"
+    assert timer.missed == 5
+
+
+def test_a_grid_point_that_is_now_belongs_to_this_poll() -> None:
+    timer = PollTimer(poll("feedback", 4, 1), due=1.0)
+    timer.advance(1.25)
+    assert (timer.due, timer.missed) == (1.5, 1)
+
+
+def test_polls_of_one_rate_are_spread_over_their_period() -> None:
+    bench = Bench(1, 2)
+    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
+    assert bench.scheduler.wake() == 5.0
+    assert kind(bench.scheduler.next_turn(5.0)) == "poll"
+    assert bench.scheduler.next_turn(5.049) is None
+    assert bench.scheduler.wake() == pytest.approx(5.05)
+    second = bench.scheduler.next_turn(5.051)
+    assert second is not None
+    assert second.request is not None
+    assert second.request.nodes == (2,)
+    assert (second.tries, second.expires) == (1, 5.051 + POLL_PATIENCE)
+    second.succeed({"s2": {}})
+    assert bench.updates == [{"s2": {}}]
+
+
+def test_missed_polls_are_counted_and_the_count_survives_new_polls() -> None:
+    bench = Bench(1)
+    bench.scheduler.set_polls([poll("a", 10, 1)], 0.0)
+    assert kind(bench.scheduler.next_turn(0.55)) == "poll"
+    assert bench.scheduler.missed_polls == 5
+    bench.scheduler.set_polls([poll("a", 10, 1)], 1.0)
+    assert bench.scheduler.missed_polls == 5
+    bench.scheduler.set_polls([], 1.0)
+    assert (bench.scheduler.missed_polls, bench.scheduler.wake()) == (5, None)
+
+
+def test_a_poll_of_nobody_who_can_be_reached_costs_no_turn() -> None:
+    bench = Bench(1, 2)
+    bench.take_offline(1)
+    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
+    taken = bench.scheduler.next_turn(0.05)
+    assert taken is not None
+    assert taken.request is not None
+    assert taken.request.nodes == (2,)
+
+
+# Probes
+
+
+def test_a_doubtful_node_is_probed_and_believed_again() -> None:
+    bench = Bench(1, online=False)
+    taken = bench.scheduler.next_turn(0.0)
+    assert taken is not None
+    assert (taken.recovery, taken.node) == (True, 1)
+    assert taken.plan is not None
+    assert run_plan(taken.plan, lambda _: None) is True
+    taken.succeed(True)
+    assert bench.node(1).condition == "online"
+    assert (bench.restarts, bench.scheduler.next_turn(0.0)) == ([], None)
+
+
+def test_a_probe_finds_that_a_servo_has_restarted() -> None:
+    bench = Bench(1, online=False)
+    bench.driver.restarted.add(1)
+    finish(bench.scheduler.next_turn(0.0))
+    assert bench.restarts == [1]
+
+
+def test_it_is_woken_for_the_next_probe() -> None:
+    bench = Bench(1)
+    bench.take_offline(1, now=2.0)
+    due = bench.node(1).next_probe
+    assert 2.0 < due < 2.0 + GREATEST_BACKOFF
+    assert bench.scheduler.next_turn(2.0) is None
+    assert bench.scheduler.wake() == due
+    assert kind(bench.scheduler.next_turn(due)) == "probe"
+
+
+# Goals
+
+
+def test_goals_of_one_tick_are_one_turn_and_each_is_told_its_outcome() -> None:
+    bench, ended = Bench(), Ended()
+    for number in (1, 2, 3):
+        bench.coalescer.put(ticket(number, ended))
+    finish(bench.scheduler.next_turn(0.0))
+    assert ended == [("s1", Outcome.SENT), ("s2", Outcome.SENT), ("s3", Outcome.SENT)]
+    assert bench.scheduler.split_groups == 0
+
+
+def test_one_error_ends_all_goals_of_its_turn() -> None:
+    bench, ended = Bench(), Ended()
+    bench.coalescer.put(ticket(1, ended))
+    bench.coalescer.put(ticket(2, ended))
+    taken = bench.scheduler.next_turn(0.0)
+    assert taken is not None
+    error = ReplyTimeout("gone")
+    taken.fail(error)
+    assert ended == [("s1", error), ("s2", error)]
+
+
+@pytest.mark.parametrize("refusal", [NotSupported("no such kind"), KeyError("a mistake in a driver")])
+def test_goals_the_driver_refuses_end_with_its_error_and_the_next_go_on(refusal: Exception) -> None:
+    bench, ended = Bench(), Ended()
+    bench.driver.refusal = refusal
+    bench.coalescer.put(ticket(1, ended))
+    bench.coalescer.put(ticket(2, ended, confirm=True))
+    assert bench.scheduler.next_turn(0.0) is None
+    assert ended == [("s1", refusal), ("s2", refusal)]
+    bench.driver.refusal = None
+    bench.coalescer.put(ticket(1, ended))
+    assert kind(bench.scheduler.next_turn(0.0)) == "goal"
+
+
+def split_bench(ended: Ended, **traits: Any) -> tuple[Bench, Job]:
+    """Three goals, a frame each; the first frame has been taken."""
+    bench = Bench(1, 2, 3, most=1)
+    for number in (1, 2, 3):
+        bench.coalescer.put(ticket(number, ended, **traits))
+    first = bench.scheduler.next_turn(0.0)
+    assert first is not None
+    assert bench.scheduler.split_groups == 1
+    assert bench.scheduler.waiting() == 2
+    return bench, first
+
+
+def test_the_frames_of_a_split_group_leave_one_after_the_other_with_a_lower_turn_between() -> None:
+    ended: Ended = []
+    bench, first = split_bench(ended)
+    bench.scheduler.submit(job(1), 0.0)
+    finish(first)
+    assert kind(bench.scheduler.next_turn(0.0)) == "request"
+    finish(bench.scheduler.next_turn(0.0))
+    finish(bench.scheduler.next_turn(0.0))
+    assert [servo for servo, _ in ended] == ["s1", "s2", "s3"]
+
+
+def test_a_frame_that_waited_too_long_is_not_sent() -> None:
+    ended: Ended = []
+    bench, first = split_bench(ended, expires=1.0)
+    finish(first)
+    assert bench.scheduler.next_turn(1.0) is None
+    assert [(servo, type(result)) for servo, result in ended[1:]] == [("s2", GoalExpired), ("s3", GoalExpired)]
+
+
+def test_a_frame_whose_caller_left_is_not_sent() -> None:
+    ended: Ended = []
+    left: list[bool] = []
+    bench, _ = split_bench(ended, gone=lambda: bool(left))
+    left.append(True)
+    assert bench.scheduler.next_turn(0.0) is None
+    assert (ended, bench.scheduler.waiting()) == ([], 0)
+
+
+def test_a_frame_whose_servo_is_in_doubt_waits_and_newer_goals_replace_it() -> None:
+    ended: Ended = []
+    bench, first = split_bench(ended)
+    finish(first)
+    bench.health.missed(bench.node(2), READ | ANSWER, 0.0, 5.0)
+    bench.coalescer.put(ticket(3, ended))
+    third = bench.scheduler.next_turn(0.1)
+    finish(third)
+    assert ended[1:] == [("s3", Outcome.SENT)], "the planned one, which was before the newer"
+    finish(bench.scheduler.next_turn(0.1))
+    assert ended[2:] == [("s3", Outcome.SENT)]
+    assert bench.scheduler.next_turn(0.1) is None
+    bench.health.recovered(bench.node(2))
+    finish(bench.scheduler.next_turn(0.1))
+    assert ended[3:] == [("s2", Outcome.SENT)]
+
+
+def test_a_disabled_servo_gets_no_goal_that_was_planned_already() -> None:
+    ended: Ended = []
+    bench, _ = split_bench(ended)
+    bench.scheduler.drop_goals(disabled, {"s2"})
+    assert [(servo, type(result)) for servo, result in ended] == [("s2", NotEnabled)]
+    finish(bench.scheduler.next_turn(0.0))
+    assert ended[1:] == [("s3", Outcome.SENT)]
+    assert bench.scheduler.next_turn(0.0) is None
+
+
+def test_a_group_asked_for_together_is_never_sent_without_one_of_it() -> None:
+    bench, ended = Bench(1, 2, 3), Ended()
+    for number in (1, 2):
+        bench.coalescer.put(ticket(number, ended, batch=1))
+    bench.scheduler.drop_goals(disabled, {"s1"})
+    assert [(servo, type(result)) for servo, result in ended] == [("s1", NotEnabled), ("s2", ActionWithheld)]
+    assert bench.scheduler.next_turn(0.0) is None
+
+
+# Requests and nodes
+
+
+def test_overload_comes_at_exactly_the_limit() -> None:
+    bench = Bench(1, 2, limit=2)
+    bench.scheduler.submit(job(1), 0.0)
+    bench.scheduler.submit(job(1), 0.0)
+    with pytest.raises(Overloaded):
+        bench.scheduler.submit(job(2), 0.0)
+    assert bench.scheduler.waiting() == 2
+    assert bench.scheduler.next_turn(0.0) is not None
+    bench.scheduler.submit(job(2), 0.0)
+
+
+def test_requests_for_an_offline_node_wait_aside_as_long_as_an_answer_would_take() -> None:
+    bench = Bench(1, 2, limit=2)
+    bench.take_offline(1)
+    waiting = [job(1), job(1)]
+    for each in waiting:
+        bench.scheduler.submit(each, 0.0)
+    with pytest.raises(Overloaded):
+        bench.scheduler.submit(job(1), 0.0)
+    bench.scheduler.submit(other := job(2), 0.0)
+    assert bench.scheduler.wake() == FIRST_DEADLINE
+    assert bench.scheduler.next_turn(FIRST_DEADLINE - 0.001) is other
+    assert [results(each) for each in waiting] == [[], []]
+    bench.scheduler.expire(FIRST_DEADLINE)
+    for each in waiting:
+        (error,) = results(each)
+        assert isinstance(error, ReplyTimeout)
+        assert "offline" in str(error)
+        assert error.raw == read(1).frame
+    assert bench.scheduler.waiting() == 0
+
+
+def test_a_busy_line_ends_them_in_time_too() -> None:
+    bench = Bench(1, 2)
+    bench.take_offline(1)
+    waiting, plan_job = job(1), stop_job()
+    bench.scheduler.submit(waiting, 0.0)
+    bench.scheduler.submit(plan_job, 0.0)
+    for _ in range(3):
+        bench.scheduler.submit(job(2), 0.0)
+    assert kind(bench.scheduler.next_turn(FIRST_DEADLINE)) == "request"
+    assert len(results(waiting)) == len(results(plan_job)) == 1
+
+
+def test_they_are_served_in_order_when_the_node_comes_back() -> None:
+    bench = Bench(1, 2)
+    queued = [job(1), job(1)]
+    for each in queued:
+        bench.scheduler.submit(each, 0.0)
+    bench.take_offline(1)
+    parked = job(1)
+    bench.scheduler.submit(parked, 0.0)
+    assert bench.scheduler.next_turn(0.001) is None
+    bench.health.recovered(bench.node(1))
+    assert [bench.scheduler.next_turn(0.001) for _ in range(3)] == [*queued, parked]
+
+
+def test_what_was_queued_when_its_node_went_offline_does_not_wait_longer_than_what_comes_then() -> None:
+    bench = Bench(1)
+    queued = job(1, expires=2.0)
+    bench.scheduler.submit(queued, 0.0)
+    bench.take_offline(1, now=0.5)
+    assert bench.scheduler.wake() == pytest.approx(0.5 + FIRST_DEADLINE)
+    bench.scheduler.expire(0.5 + FIRST_DEADLINE)
+    assert isinstance(results(queued)[0], ReplyTimeout)
+
+
+def test_urgent_requests_are_said_to_an_offline_node() -> None:
+    bench = Bench(1)
+    bench.scheduler.submit(before := job(1, urgent=True), 0.0)
+    bench.take_offline(1)
+    bench.scheduler.submit(after := job(1, urgent=True), 0.0)
+    assert bench.scheduler.next_turn(0.0) is before
+    assert bench.scheduler.next_turn(0.0) is after
+
+
+def test_an_offline_nodes_callers_who_left_are_forgotten() -> None:
+    bench = Bench(1)
+    bench.take_offline(1)
+    waiting = job(1)
+    bench.scheduler.submit(waiting, 0.0)
+    assert isinstance(waiting.sink, Sink)
+    waiting.sink.cancelled = True
+    bench.scheduler.expire(0.0)
+    assert (bench.scheduler.waiting(), results(waiting)) == (0, [])
+
+
+def test_a_retried_request_stays_first_of_its_node_and_the_other_nodes_go_before_it() -> None:
+    bench = Bench(1, 2)
+    first, second, other = job(1), job(1), job(2)
+    for each in (first, second, other):
+        bench.scheduler.submit(each, 0.0)
+    assert bench.scheduler.next_turn(0.0) is first
+    bench.scheduler.retry(first)
+    assert [bench.scheduler.next_turn(0.0) for _ in range(3)] == [other, first, second]
+
+
+# Sessions and the e-stop
+
+
+def test_in_an_exclusive_session_only_its_requests_and_the_estop_go() -> None:
+    flood = Flood("goal", "request", "poll", "probe")
+    flood.kinds(3)
+    scheduler = flood.bench.scheduler
+    scheduler.session = session = object()
+    ours, stop = job(2, session=session), stop_job()
+    scheduler.submit(ours, flood.now)
+    scheduler.estop.append(stop)
+    assert [flood.turn() for _ in range(3)] == [stop, ours, None]
+    assert scheduler.wake() == pytest.approx(1.002), "the first request's end, no probe and no poll"
+    scheduler.session = None
+    assert set(flood.kinds(8)) == {"goal", "request", "poll", "probe"}
+
+
+def test_an_estop_drops_what_moves_wherever_it_waits() -> None:
+    ended: Ended = []
+    bench, _ = split_bench(ended)
+    bench.coalescer.put(ticket(1, ended))
+    moving, reading = job(1, motion=True), job(1)
+    parked_moving, parked_reading = job(3, motion=True), job(3)
+    for each in (moving, reading):
+        bench.scheduler.submit(each, 0.0)
+    bench.take_offline(3)
+    for each in (parked_moving, parked_reading):
+        bench.scheduler.submit(each, 0.0)
+    bench.scheduler.drop(estopped, motion_only=True)
+    assert sorted(servo for servo, _ in ended) == ["s1", "s2", "s3"]
+    assert {type(result) for _, result in ended} == {EStopped}
+    assert [type(each) for job_ in (moving, parked_moving) for each in results(job_)] == [EStopped, EStopped]
+    bench.health.recovered(bench.node(3))
+    assert {bench.scheduler.next_turn(0.0), bench.scheduler.next_turn(0.0)} == {reading, parked_reading}
+    assert bench.scheduler.next_turn(0.0) is None
+
+
+def test_a_lost_line_ends_everything() -> None:
+    ended: Ended = []
+    bench, _ = split_bench(ended)
+    jobs = [job(1), job(2, motion=True), job(3)]
+    bench.take_offline(3)
+    for each in jobs:
+        bench.scheduler.submit(each, 0.0)
+    bench.scheduler.estop.append(stop := stop_job())
+    bench.scheduler.drop(estopped, motion_only=False)
+    assert [len(results(each)) for each in (*jobs, stop)] == [1, 1, 1, 1]
+    assert len(ended) == 2, "the first frame was taken before"
+    assert (bench.scheduler.waiting(), bench.scheduler.next_turn(0.0)) == (0, None)
+
+
+# Everything at once
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) -> None:
+    rng, now, limit, nodes = random.Random(seed), 0.0, 8, (1, 2, 3, 4)
+    bench, jobs = Bench(*nodes, limit=limit, most=2), list[Job]()
+    accepted, ended = Counter[str](), Ended()
+    bench.scheduler.set_polls([poll("feedback", 200, *nodes)], now)
+
+    def submit() -> None:
+        new = job(rng.choice(nodes), expires=now + rng.uniform(0.01, 0.1), motion=rng.random() < 0.2)
+        try:
+            bench.scheduler.submit(new, now)
+        except Overloaded:
+            return
+        jobs.append(new)
+
+    def put() -> None:
+        number = rng.choice(nodes)
+        accepted[f"s{number}"] += 1
+        bench.coalescer.put(ticket(number, ended, expires=now + rng.uniform(0.001, 0.05), batch=rng.choice((None, None, 1, 2))))
+
+    def turn() -> None:
+        taken = bench.scheduler.next_turn(now)
+        if taken is None:
+            bench.scheduler.expire(now)
+        elif rng.random() < 0.1:
+            taken.fail(ReplyTimeout("no answer"))
+        elif taken.plan is not None:
+            finish(taken)
+        elif rng.random() < 0.1:
+            bench.scheduler.retry(taken)
+        else:
+            taken.succeed({})
+
+    def node() -> None:
+        changed = bench.node(rng.choice(nodes))
+        if rng.random() < 0.5:
+            bench.health.missed(changed, READ | ANSWER, now, now)
+        else:
+            bench.health.recovered(changed)
+
+    def drop() -> None:
+        if rng.random() < 0.05:
+            bench.scheduler.drop(estopped, motion_only=rng.random() < 0.8)
+        else:
+            bench.scheduler.drop_goals(disabled, {f"s{rng.choice(nodes)}"})
+
+    for _ in range(1000):
+        rng.choices((submit, put, turn, node, drop), (30, 30, 40, 5, 2))[0]()
+        now += rng.choice((0.0, 0.001, 0.005))
+        assert 0 <= len(bench.scheduler.requests) <= 3 * limit
+        assert 0 <= len(bench.coalescer) <= len(nodes)
+    bench.scheduler.drop(estopped, motion_only=False)
+    assert bench.scheduler.waiting() == 0
+    assert Counter(servo for servo, _ in ended) == accepted
+    assert [len(results(each)) for each in jobs] == [1] * len(jobs)
+    assert len(jobs) > 100

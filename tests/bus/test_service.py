@@ -38,7 +38,7 @@ async def test_a_servo_that_comes_later_is_introduced() -> None:
     async with puppet_bus(started=False) as (bus, puppet, _, events):
         puppet.script = lambda frame: [] if frame[2] == 2 else None
         await bus.start()
-        assert bus.records["s2"].identity is None
+        assert [record.identity is None for record in bus.records.values()] == [False, True]
         puppet.script = lambda frame: None
         await asyncio.sleep(5)
         assert bus.records["s2"].identity is not None
@@ -60,7 +60,7 @@ async def test_one_that_answers_but_not_who_it_is_is_not_asked_all_the_time() ->
 
 @virtual
 async def test_notes_of_an_identity_are_told_once() -> None:
-    async with puppet_bus() as (bus, puppet, _, events):
+    async with puppet_bus() as (bus, _, _, events):
         first = events.count("servo_note")
         assert first > 0, "a puppet says model number 0 and response level 0"
         await bus.identify("s1")
@@ -90,7 +90,7 @@ async def test_an_exclusive_session_has_the_line_alone() -> None:
 
 @virtual
 async def test_no_session_while_the_e_stop_holds_or_something_is_enabled() -> None:
-    async with puppet_bus() as (bus, puppet, _, _):
+    async with puppet_bus() as (bus, _, _, _):
         bus.records["s1"].enabled = True
         with pytest.raises(LeaseHeld, match="s1 is enabled"):
             async with bus.exclusive():

@@ -25,7 +25,12 @@ def soak_cancel(count: int) -> bool:
 
 def soak_line(_: int) -> bool:
     figures = line.main()
-    return figures.rate_with_dead >= 0.8 * figures.rate_before and figures.unplug < 0.05 and figures.replug < 0.25 and figures.cpu < 0.02
+    return (
+        figures.rate_with_dead >= 0.8 * figures.rate_before
+        and figures.unplug < 0.05
+        and figures.replug < 0.25
+        and figures.cpu < 0.02
+    )
 
 
 def bench_turns(_: int) -> bool:

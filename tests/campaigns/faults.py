@@ -66,7 +66,7 @@ async def _faults(reads: int, damage: FaultOptions, seed: int) -> Result:
             await _read(bus, oracle, rng, result, number % SERVOS + 1 if number < SERVOS else rng.randrange(SERVOS) + 1)
 
     await asyncio.gather(*(caller(number) for number in range(SERVOS + 2)))
-    return _end(bus, result)
+    return await _end(bus, result)
 
 
 async def _read(bus, oracle: Oracle, rng: random.Random, result: Result, node: int) -> None:  # type: ignore[no-untyped-def]
@@ -81,11 +81,11 @@ async def _read(bus, oracle: Oracle, rng: random.Random, result: Result, node: i
         result.wrong += not oracle.right(value, node, address, asked)
 
 
-def _end(bus, result: Result) -> Result:  # type: ignore[no-untyped-def]
+async def _end(bus, result: Result) -> Result:  # type: ignore[no-untyped-def]
     result.turns = bus.stats.counts["turns"]
     result.waiting = bus.scheduler.waiting()
     result.counts = dict(bus.stats.counts)
-    bus.master.close()
+    await bus.master.close()
     result.leaked = len(asyncio.all_tasks()) - 1
     return result
 
@@ -113,4 +113,4 @@ async def _cancel(cancels: int, seed: int) -> Result:
             elif ended is not None:
                 raise ended
     await asyncio.sleep(5)
-    return _end(bus, result)
+    return await _end(bus, result)

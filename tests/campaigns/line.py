@@ -38,8 +38,10 @@ class Figures:
     """Share of one core while the plug was out."""
 
     def report(self) -> None:
-        print(f"ten servos, one dead: {self.rate_with_dead / self.rate_before:.0%} of the others' rate "
-              f"({self.rate_before:.0f} -> {self.rate_with_dead:.0f} reads/s)")
+        print(
+            f"ten servos, one dead: {self.rate_with_dead / self.rate_before:.0%} of the others' rate "
+            f"({self.rate_before:.0f} -> {self.rate_with_dead:.0f} reads/s)"
+        )
         print(f"unplug: {self.unplug_errors} awaits in flight failed within {1e3 * self.unplug:.1f} ms")
         print(f"while unplugged: {self.cpu:.2%} of a core")
         print(f"replug: first value after {1e3 * self.replug:.0f} ms")

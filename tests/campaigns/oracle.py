@@ -42,7 +42,7 @@ class Oracle:
         self.nodes = frozenset(nodes)
         self._loop = loop
         self._codec = SmsCodec()
-        self._deliver: Callable[[bytes], None] = bytes
+        self._deliver: Callable[[bytes], object] = bytes
         self._questions: list[Question | None] = [None] * NUMBERS
         self._count = 0
 
@@ -71,8 +71,8 @@ class Oracle:
         return answer(number, size)
 
     def right(self, value: Sequence[int], node: int, address: int, asked: float) -> bool:
-        """Whether this is the answer to a question asked of that node, up to the end of that span, not before `asked`. (A question
-        may begin a byte earlier than its caller's span: so it is put where its echo could be the answer.)"""
+        """Whether this is the answer to a question asked of that node, up to the end of that span, not before `asked`. (A
+        question may begin a byte earlier than its caller's span: so it is put where its echo could be the answer.)"""
         size = len(value)
         number = int.from_bytes(bytes(value[-2:]), "little")
         question = self._questions[number]
@@ -97,8 +97,8 @@ def service(nodes: int, faults: FaultOptions | None = None, *, echo: str = "off"
     """A bus of so many servos on an oracle, with the faults in between; the link is to be connected."""
     loop = asyncio.get_running_loop()
     servos = "".join(f"      s{number}: {{id: {number}, model: sts}}\n" for number in range(1, nodes + 1))
-    text = f"version: 1\nbuses:\n  arm:\n    protocol: sms\n    port: 'sim:'\n    baudrate: 1000000\n    echo: {echo}\n    servos:\n{servos}"
-    config = parse_config(text, "campaign", Path())
+    head = "version: 1\nbuses:\n  arm:\n    protocol: sms\n    port: 'sim:'\n    baudrate: 1000000\n"
+    config = parse_config(f"{head}    echo: {echo}\n    servos:\n{servos}", "campaign", Path())
     options, models = config.buses["arm"], config.models["arm"]
     oracle = Oracle(range(1, nodes + 1), loop)
     far = oracle if faults is None else FaultyEnd(oracle, faults, loop, rename=_neighbour, node_of=node_of)

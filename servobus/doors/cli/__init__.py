@@ -6,7 +6,6 @@ What every command shares (config, output, errors, exit status) stands in `commo
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 from importlib.metadata import version
 from typing import Any
@@ -82,8 +81,4 @@ def status_of(arguments: list[str] | None = None) -> int:
         return error.exit_status
     except (KeyboardInterrupt, click.Abort):
         return INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read our output has enough; the interpreter must not complain about it at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     return result if isinstance(result, int) else 0

@@ -45,7 +45,9 @@ class Options:
     def load(self) -> Config:
         """The config; on simulated servos when nothing shall be sent. Raises ConfigError."""
         if self.config is None and not Path(DEFAULT_CONFIG).exists():
-            raise ConfigError(f"no config: give -c CONFIG, set SERVOBUS_CONFIG, or make ./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)")
+            raise ConfigError(
+                f"no config: give -c CONFIG, set SERVOBUS_CONFIG, or make ./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)"
+            )
         config = load_config(self.config or DEFAULT_CONFIG)
         return simulated(config) if self.dry_run else config
 
@@ -53,7 +55,9 @@ class Options:
 def servo_options(command: F) -> F:
     """Adds the options and hands them over as one `options`."""
 
-    @click.option("-c", "--config", envvar="SERVOBUS_CONFIG", metavar="CONFIG", help="Bus config (YAML). Default: ./servobus.yaml.")
+    @click.option(
+        "-c", "--config", envvar="SERVOBUS_CONFIG", metavar="CONFIG", help="Bus config (YAML). Default: ./servobus.yaml."
+    )
     @click.option("--json", "as_json", is_flag=True, help="For machines: one JSON document on standard output.")
     @click.option("--trace", is_flag=True, help="Print every frame, both ways and decoded, on standard error.")
     @click.option("--dry-run", is_flag=True, help="Open no port: run on simulated servos and print what would be sent.")
@@ -109,8 +113,8 @@ def tracer(config: Config, options: Options) -> Trace | None:
 
 
 def run(main: Callable[[], Coroutine[Any, Any, R]], *, terminated: int = 128 + signal.SIGTERM) -> R:
-    """Run it on the fastest loop there is. Ctrl-C and SIGTERM end it in order, so that exit policies are applied; the status after
-    SIGTERM is `terminated`."""
+    """Run it on the fastest loop there is. Ctrl-C and SIGTERM end it in order, so that exit policies are applied; after
+    SIGTERM the status is `terminated`."""
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_until_terminated(main, terminated))
 

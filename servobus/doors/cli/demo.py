@@ -67,15 +67,24 @@ def demo(seconds: float, as_json: bool) -> int:
     """
     logs(logging.ERROR)
     servos = {"sts": 6, "sms": 4}
-    lines = {model: "\n".join(f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}" for number in range(1, count + 1)) for model, count in servos.items()}
+    lines = {
+        model: "\n".join(
+            f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}" for number in range(1, count + 1)
+        )
+        for model, count in servos.items()
+    }
     config = parse_config(CONFIG.format(**lines), "demo")
     if not as_json:
         for name, load in loads_of(config).items():
             options = config.buses[name]
-            verdict = "carries that" if load.total <= 100 else "cannot carry all of that: goals are replaced by newer ones, polls are skipped"
+            verdict = (
+                "carries that"
+                if load.total <= 100
+                else "cannot carry all of that: goals are replaced by newer ones, polls are skipped"
+            )
             click.echo(
-                f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each and {FEEDBACK_HZ:g} Hz feedback "
-                f"ask {load.total:.0f} % of the line; it {verdict}"
+                f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each "
+                f"and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line; it {verdict}"
             )
 
     async def main() -> int:

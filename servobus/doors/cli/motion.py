@@ -1,5 +1,6 @@
-"""Commands that move or stop: move, enable, disable, stop, clear. No daemon runs, so each opens the port itself and leaves it again:
-what it enabled is then left as the servo's `on_exit` says."""
+"""Commands that move or stop: move, enable, disable, stop, clear. No daemon runs, so each opens the port itself and
+leaves it again: what it enabled is then left as the servo's `on_exit` says.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,13 @@ NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
 @click.option("--timeout", default=10.0, show_default=True, type=click.FloatRange(min=0), help="Seconds to arrive within.")
 @servo_options
 def move(
-    options: Options, targets: tuple[str, ...], speed: float | None, duration: float | None, together: bool, confirm: bool, timeout: float
+    options: Options,
+    targets: tuple[str, ...],
+    speed: float | None,
+    duration: float | None,
+    together: bool,
+    confirm: bool,
+    timeout: float,
 ) -> int:
     """Enable servos, move them, wait until they stand, and leave them as their `on_exit` says.
 
@@ -42,7 +49,11 @@ def move(
             if options.as_json:
                 emit({name: {"position": state.position} for name, state in states.items()})
             else:
-                echo_table(None, ("servo", "position", "then"), [(name, state.position, _left(rig, name)) for name, state in states.items()])
+                echo_table(
+                    None,
+                    ("servo", "position", "then"),
+                    [(name, state.position, _left(rig, name)) for name, state in states.items()],
+                )
             return 0
 
     return run(main)
@@ -129,7 +140,10 @@ def stop(options: Options) -> int:
             if options.as_json:
                 emit(reports)
             else:
-                rows = [(name, report.action, report.written, report.confirmed, report.detail or None) for name, report in reports.items()]
+                rows = [
+                    (name, report.action, report.written, report.confirmed, report.detail or None)
+                    for name, report in reports.items()
+                ]
                 echo_table(None, ("servo", "action", "written", "confirmed", "detail"), rows)
             return 0 if _all_confirmed([report.confirmed for report in reports.values()]) else 1
 

@@ -33,10 +33,14 @@ def check(config: str, as_json: bool) -> None:
     if as_json:
         emit({name: _as_dict(load) for name, load in loads.items()})
     else:
-        echo_table(None, ("bus", "goals %", "feedback %", "health %", "load %", "goal ms", "e-stop ms", "silent ms"), _rows(loads))
+        echo_table(
+            None, ("bus", "goals %", "feedback %", "health %", "load %", "goal ms", "e-stop ms", "silent ms"), _rows(loads)
+        )
     heavy = [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]
     if heavy:
-        raise ConfigError(f"{config}: more than the line carries: {', '.join(heavy)}; lower poll or goal_rate, or raise the baud rate")
+        raise ConfigError(
+            f"{config}: more than the line carries: {', '.join(heavy)}; lower poll or goal_rate, or raise the baud rate"
+        )
     if not as_json:
         click.echo(f"{config}: ok")
 
@@ -105,7 +109,9 @@ def decode(hex_bytes: tuple[str, ...], protocol: str, as_json: bool) -> None:
     try:
         frame = bytes.fromhex(text)
     except ValueError:
-        raise click.BadParameter(f"{text!r} is no hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX") from None
+        raise click.BadParameter(
+            f"{text!r} is no hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX"
+        ) from None
     codec = PROTOCOLS[protocol].codec()
     words = {"request": codec.describe(frame, sent=True), "reply": codec.describe(frame, sent=False)}
     if as_json:

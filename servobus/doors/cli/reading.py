@@ -27,7 +27,9 @@ def ping(options: Options, names: tuple[str, ...]) -> int:
             answers = await _each(rig, names, rig.ping)
             failed = {name: str(answer) for name, answer in answers.items() if isinstance(answer, ServobusError)}
             if options.as_json:
-                emit({name: {"error": failed[name]} if name in failed else {"status": answer} for name, answer in answers.items()})
+                emit(
+                    {name: {"error": failed[name]} if name in failed else {"status": answer} for name, answer in answers.items()}
+                )
             else:
                 echo_table(None, ("servo", "answer"), [(name, failed.get(name) or _health(rig, name)) for name in answers])
             return 1 if failed else 0
@@ -118,7 +120,8 @@ def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, 
         async with opened(options, [name]) as rig:
             full = rig.full_name(name)
             found = {
-                register: await rig.write_register(full, register, value, raw=raw, persist=persist) for register, value in wanted.items()
+                register: await rig.write_register(full, register, value, raw=raw, persist=persist)
+                for register, value in wanted.items()
             }
             if options.as_json:
                 emit({full: found})
@@ -141,7 +144,7 @@ def number_or_word(text: str) -> int | float | str:
     """A number as people write it, hexadecimal too; else the word."""
     for kind in (lambda value: int(value, 0), float):
         try:
-            return kind(text)  # type: ignore[no-any-return]
+            return kind(text)
         except ValueError:
             continue
     return text

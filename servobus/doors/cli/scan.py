@@ -31,7 +31,9 @@ BUS = "line"
 @click.argument("bus", required=False)
 @click.option("--port", help="Scan this port instead of a bus of the config.")
 @click.option("--protocol", default="sms", show_default=True, help="What is spoken on --port.")
-@click.option("--baudrate", "rates", metavar="N,...|all", help="Rates to try. Default: the bus's own; with --port all of the protocol's.")
+@click.option(
+    "--baudrate", "rates", metavar="N,...|all", help="Rates to try. Default: the bus's own; with --port all of the protocol's."
+)
 @click.option("--ids", metavar="A-B", help="Ids to ask. Default: every one.")
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a starter config of what was found.")
 @servo_options
@@ -83,7 +85,13 @@ def _progress() -> Iterator[Any]:
     if not sys.stderr.isatty():
         yield lambda asked, count, found: None
         return
-    columns = (TextColumn("scanning"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]} found"))
+    columns = (
+        TextColumn("scanning"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[found]} found"),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("scan", total=None, found=0)
         yield lambda asked, count, found: bar.update(task, completed=asked, total=count, found=found)
@@ -102,7 +110,7 @@ def _bare(port: str, protocol: str, rates: str | None) -> Config:
 def _bus_name(config: Config, bus: str | None) -> str:
     if bus is None and len(config.buses) == 1:
         return next(iter(config.buses))
-    if bus not in config.buses:
+    if bus is None or bus not in config.buses:
         said = "say which bus" if bus is None else f"no bus {bus!r}"
         raise UnknownName(f"{said}: there are {', '.join(config.buses)}")
     return bus
@@ -168,4 +176,5 @@ def _starter(config: Config, name: str, found: list[Found]) -> str:
     text = io.StringIO()
     YAML().dump(CommentedMap(version=1, buses=buses), text)
     note = "" if len(buses) == 1 else "# Several rates on one line: set all servos to one, then keep one bus\n"
-    return f"# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n{note}{text.getvalue()}"
+    head = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
+    return f"{head}{note}{text.getvalue()}"

@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 from rich.live import Live
 
-from servobus.doors.cli.common import STATE_COLUMNS, Options, emit, echo_table, logs, opened, run, servo_options, state_row, table
+from servobus.doors.cli.common import STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, state_row, table
 from servobus.local import LocalRig
 from servobus.rig import Snapshot
 
@@ -35,7 +35,7 @@ def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | No
         async with opened(options, names) as rig:
             shown = rig.full_names(names)
             if options.as_json or not sys.stdout.isatty():
-                await _pictures(rig, shown, hz, count, lambda snapshot: emit(snapshot))
+                await _pictures(rig, shown, hz, count, emit)
             else:
                 with Live(console=Console(), auto_refresh=False, screen=False) as live:
                     await _pictures(rig, shown, hz, count, lambda snapshot: live.update(_picture(snapshot), refresh=True))
@@ -51,10 +51,9 @@ def _picture(snapshot: Snapshot) -> Any:
 async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, show: Any) -> None:
     unpolled = [name for name in names if not rig.config.buses[rig.names[name][0]].poll.rates()]
     taken = 0
-    async for snapshot in rig.watch(hz):
-        if unpolled:
-            await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
-            snapshot = rig.snapshot()
+    async for _ in rig.watch(hz):
+        await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
+        snapshot = rig.snapshot()
         show({name: snapshot[name] for name in names})
         taken += 1
         if taken == count:

@@ -35,7 +35,9 @@ def find_model(name: str, folder: Path) -> SmsModel:
     if name in packaged:
         return packaged[name]
     if not name.endswith(SUFFIX):
-        raise ConfigError(f"model {yamlfile.clip(name)!r} is not known; there are {', '.join(packaged)}, or name a file *{SUFFIX}")
+        raise ConfigError(
+            f"model {yamlfile.clip(name)!r} is not known; there are {', '.join(packaged)}, or name a file *{SUFFIX}"
+        )
     return read_model(folder / name)
 
 

@@ -1,0 +1,124 @@
+"""Commands that stay, as processes: what they print, and how they end by signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.config_mistakes import GOOD
+
+LIMP = GOOD.replace("id: 1,", "id: 1, on_exit: limp,")
+
+
+@contextmanager
+def servobus(*arguments: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "servobus", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> str:
+    path = tmp_path / "rig.yaml"
+    path.write_text(LIMP)
+    return str(path)
+
+
+def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
+    """The first log line of that name."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        entry: dict[str, object] = json.loads(line)
+        if entry["event"] == event:
+            return entry
+    raise AssertionError(f"{event} was never logged")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_run_ends_in_order(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("run", rig, "--log-every", "0.2") as process:
+        assert until(process, "running")["buses"] == ["arm"]
+        state = until(process, "state")
+        assert state["positions"] == {"shoulder": 0.0, "elbow": 0.0}
+        process.send_signal(number)
+        until(process, "ended")
+        assert process.wait(10) == status
+
+
+def test_run_waits_for_a_port(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(GOOD.replace('"sim:"', str(tmp_path / "port")))
+    with servobus("run", str(path)) as process:
+        assert "does not exist" in str(until(process, "waiting_for_port")["reason"])
+        until(process, "running")
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_a_simulator_and_a_daemon_on_its_port(rig: str, tmp_path: Path) -> None:
+    with servobus("sim", rig, "--folder", str(tmp_path / "ports")) as sim:
+        assert sim.stdout is not None
+        name, path = sim.stdout.readline().split()
+        assert (name, path) == ("arm", str(tmp_path / "ports" / "arm"))
+        real = tmp_path / "real.yaml"
+        real.write_text(LIMP.replace('"sim:"', path))
+        with servobus("run", str(real)) as daemon:
+            until(daemon, "running")
+            with servobus("read", "-c", str(real)) as second:
+                _, told = second.communicate(timeout=20)
+                assert second.returncode == 1
+                assert f"process {daemon.pid}" in told
+            sim.kill()
+            assert until(daemon, "line_down")["bus"] == "arm"
+            daemon.terminate()
+            assert daemon.wait(10) == 0
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_sim_prints_its_ports_and_nothing_else(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("sim", rig) as process:
+        assert process.stdout is not None
+        name, path = process.stdout.readline().split()
+        assert name == "arm"
+        assert os.path.exists(path)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=10)
+        assert (out, err.strip(), process.returncode) == ("", "", status)
+
+
+def test_an_interrupted_scan_tells_what_it_found(rig: str) -> None:
+    with servobus("scan", "-c", rig, "--baudrate", "9600,1000000", "--json", "--trace") as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "id 9 PING" in line:
+                break
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert isinstance(json.loads(out), list)
+
+
+def test_who_reads_no_further_is_told_nothing() -> None:
+    with servobus("schema") as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+        assert process.wait(10) == 1
