@@ -140,6 +140,14 @@ def test_at_most_one_frame_waits_behind_the_one_that_is_leaving() -> None:
     assert line.ready_at(1.0101, urgent=False) <= 1.0101
 
 
+def test_what_is_heard_meanwhile_lets_no_third_frame_in() -> None:
+    line = quiet_line(baudrate=10_000)
+    line.speak(FRAME, 1.0, 0.0)
+    line.speak(FRAME, 1.0, 0.0)
+    line.listen_out(1.0)
+    assert line.ready_at(1.0, urgent=False) == pytest.approx(1.01)
+
+
 def test_a_line_without_a_baud_rate_takes_no_time() -> None:
     line = quiet_line()
     line.speak(FRAME, 1.0, 0.0)
