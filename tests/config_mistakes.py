@@ -39,7 +39,9 @@ MISTAKES = {
     "duplicate key": Mistake("      elbow:", "      shoulder:", 10, 7, "shoulder again (first on line 9)"),
     "duplicate id": Mistake("id: 2", "id: 1", 10, 19, "buses.arm.servos.elbow.id: found id 1 again"),
     "id out of range": Mistake("id: 2", "id: 254", 10, 19, "found 254; expected less than or equal to 253"),
-    "boolean for a number": Mistake("id: 2", "id: yes", 10, 19, "buses.arm.servos.elbow.id: found 'yes'; expected a valid integer"),
+    "boolean for a number": Mistake(
+        "id: 2", "id: yes", 10, 19, "buses.arm.servos.elbow.id: found 'yes'; expected a valid integer"
+    ),
     "limits turned round": Mistake("[-90, 90]", "[90, -90]", 9, 7, "the first must be below the second"),
     "not a number": Mistake("[-90, 90]", "[-90, .nan]", 9, 51, "write a finite number"),
     "unknown model": Mistake("id: 2, model: sts", "id: 2, model: stx", 10, 29, "there are scs, sms, sms_cl, sts"),
@@ -53,6 +55,8 @@ MISTAKES = {
     "alias": Mistake("    poll: {feedback: 50}", "    poll: *p", 7, 11, "found an alias"),
     "second document": Mistake("buses:\n", "---\nbuses:\n", 2, 1, "the border of a second document"),
     "rate of zero": Mistake("feedback: 50", "feedback: 0", 7, 22, "expected greater than 0"),
-    "faults on a real line": Mistake('port: "sim:"', "port: /dev/ttyS9\n    faults: {loss: 0.1}", 3, 3, "faults are for a simulated line"),
+    "faults on a real line": Mistake(
+        'port: "sim:"', "port: /dev/ttyS9\n    faults: {loss: 0.1}", 3, 3, "faults are for a simulated line"
+    ),
     "bad address": Mistake('port: "sim:"', "port: tcp://nowhere", 5, 11, "tcp://HOST:PORT"),
 }

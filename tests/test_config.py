@@ -114,7 +114,9 @@ def test_two_simulated_buses_are_two_lines() -> None:
     assert len(parse_config(two_buses('"sim:"', '"sim:"'), "rig.yaml").buses) == 2
 
 
-@pytest.mark.parametrize(("key", "greatest", "beyond"), [("torque_limit", "100", "100.1"), ("limits", "[0, 2699.9]", "[0, 2700]")])
+@pytest.mark.parametrize(
+    ("key", "greatest", "beyond"), [("torque_limit", "100", "100.1"), ("limits", "[0, 2699.9]", "[0, 2700]")]
+)
 def test_what_the_model_cannot_do_at_its_edge(key: str, greatest: str, beyond: str) -> None:
     parse_config(GOOD.replace("id: 2,", f"id: 2, {key}: {greatest},"), "rig.yaml")
     assert f"elbow.{key}" in complaint(GOOD.replace("id: 2,", f"id: 2, {key}: {beyond},"))
@@ -140,7 +142,9 @@ def test_a_model_file_beside_the_config(tmp_path: Path) -> None:
 
 # Attacks
 
-BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
 ATTACKS = {
     "alias bomb": BOMB,
     "self alias": "a: &a [*a]\n",

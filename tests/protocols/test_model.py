@@ -40,7 +40,9 @@ def test_bytes_of_raw_values(register: Register, raw: int, little: str) -> None:
     assert register.decode(data[::-1], "big") == raw
 
 
-@pytest.mark.parametrize(("register", "raw"), [(SIGNED, 32768), (SIGNED, -32768), (SHORT, 1024), (PLAIN, 0), (PLAIN, 1001), (CODES, 256)])
+@pytest.mark.parametrize(
+    ("register", "raw"), [(SIGNED, 32768), (SIGNED, -32768), (SHORT, 1024), (PLAIN, 0), (PLAIN, 1001), (CODES, 256)]
+)
 def test_one_beyond_the_edge_is_refused(register: Register, raw: int) -> None:
     with pytest.raises(LimitError, match=f"{register.name}: raw value {raw} is outside"):
         register.encode(raw, "little")
@@ -102,7 +104,9 @@ def test_registers_by_name_and_alias() -> None:
     assert model.reach == {}
 
 
-@pytest.mark.parametrize(("status", "names"), [(None, ()), (0, ()), (1, ("voltage",)), (5, ("voltage", "temperature")), (8, ("bit 3",))])
+@pytest.mark.parametrize(
+    ("status", "names"), [(None, ()), (0, ()), (1, ("voltage",)), (5, ("voltage", "temperature")), (8, ("bit 3",))]
+)
 def test_names_of_faults(status: int | None, names: tuple[str, ...]) -> None:
     assert ServoModel.model_validate(MODEL).fault_names(status) == names
 
