@@ -83,7 +83,7 @@ class Line:
         if self._listening_since is None:
             self._listening_since = now
             self.drains += 1
-        self._quiet_at = max(self._quiet_at, now + max(quiet, self.traits.gap, 2 * self.traits.byte_time))
+        self._quiet_at = max(self._quiet_at, now + max(quiet, self.traits.gap, self.traits.latency, 2 * self.traits.byte_time))
 
     @property
     def listening_out(self) -> bool:

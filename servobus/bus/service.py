@@ -167,6 +167,7 @@ class BusService:
         """Counters, latencies, and the condition of each node, for people and machines."""
         counts = self.stats.counts
         counts["drains"] = self.line.drains
+        counts["collisions"] = self.line.echo.collisions if self.line.echo else 0
         counts["polls_missed"] = self.scheduler.missed_polls
         counts["goal_groups_split"] = self.scheduler.split_groups
         counts["goal_turns"] = self.scheduler.goal_turns

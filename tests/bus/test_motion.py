@@ -5,6 +5,7 @@ enabled or parked.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 import pytest
 
@@ -28,25 +29,46 @@ async def test_a_caller_who_leaves_takes_its_goal_along() -> None:
         assert len(bus.scheduler.coalescer) == 0
 
 
+def keeping() -> Callable[[bytes], Answers | None]:
+    """A servo that keeps what is written."""
+    memory: dict[int, bytes] = {}
+
+    def script(frame: bytes) -> Answers | None:
+        if frame[4] == Instruction.WRITE:
+            memory[frame[5]] = frame[6:-1]
+        elif frame[4] == Instruction.READ and frame[5] in memory:
+            return [(0.001, encode(frame[2], 0, memory[frame[5]][: frame[6]]))]
+        return None
+
+    return script
+
+
 @virtual
 async def test_enable_asks_who_it_is_first_if_that_is_not_known() -> None:
     async with puppet_bus(started=False) as (bus, puppet, _, _):
-        memory: dict[int, bytes] = {}
-
-        def script(frame: bytes) -> Answers | None:
-            """A servo that keeps what is written."""
-            if frame[4] == Instruction.WRITE:
-                memory[frame[5]] = frame[6:-1]
-            elif frame[4] == Instruction.READ and frame[5] in memory:
-                return [(0.001, encode(frame[2], 0, memory[frame[5]][: frame[6]]))]
-            return None
-
-        puppet.script = script
+        puppet.script = keeping()
         await bus.motion.enable("s1")
         assert bus.records["s1"].enabled
         identity = bus.records["s1"].identity
         assert identity is not None
         assert puppet.heard[1][4:6] == bytes((Instruction.READ, 0)), "behind the fence comes the question who it is"
+
+
+@virtual
+async def test_an_e_stop_in_the_moment_in_which_enable_succeeds_wins() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        keep = keeping()
+
+        def script(frame: bytes) -> Answers | None:
+            answers = keep(frame)
+            if answers and frame[4:6] == bytes((Instruction.READ, 40)):
+                bus.motion.latched = True  # the last answer is on its way
+            return answers
+
+        puppet.script = script
+        with pytest.raises(EStopped, match="while it was being enabled"):
+            await bus.motion.enable("s1")
+        assert not bus.records["s1"].enabled
 
 
 @virtual

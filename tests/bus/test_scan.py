@@ -8,7 +8,8 @@ from contextlib import aclosing
 import pytest
 
 from servobus.bus.scan import scan
-from servobus.errors import LinkDown
+from servobus.errors import LinkDown, NotSupported
+from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction
 from tests.bus.puppet import puppet_bus
 from tests.virtual import virtual
@@ -57,3 +58,11 @@ async def test_a_line_that_goes_down_ends_the_scan() -> None:
             async for _ in scan(bus, [bus.options.baudrate], range(200)):
                 pass
         assert bus.scheduler.session is None
+
+
+@virtual
+async def test_a_line_whose_rate_is_set_elsewhere_is_scanned_at_that_rate_only() -> None:
+    async with puppet_bus(traits=LineTraits()) as (bus, _, _, _):
+        with pytest.raises(NotSupported, match="cannot change its baud rate"):
+            await anext(scan(bus, [9600], [1]))
+        assert (await anext(scan(bus, [bus.options.baudrate], [1])))[:2] == (1, 1)

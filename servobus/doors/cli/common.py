@@ -7,12 +7,14 @@ import dataclasses
 import functools
 import json
 import logging
+import math
 import os
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from servobus.config import Config, load_config
+from servobus.doors.cli.tracing import Tracer
 from servobus.errors import ConfigError
 from servobus.local import LocalRig, Trace, open_rig
 from servobus.protocols.base import State
@@ -31,6 +34,17 @@ from servobus.rig import full_name
 R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 DEFAULT_CONFIG = "servobus.yaml"
+ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+
+
+class Number(click.FloatRange):
+    """A finite number within a range: the range of click lets nan and inf through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,46 +89,36 @@ def simulated(config: Config) -> Config:
 
 
 @asynccontextmanager
-async def opened(options: Options, names: Collection[str] = ()) -> AsyncIterator[LocalRig]:
-    """A rig with the buses of these servos, or with all. Raises UnknownName before a port is opened."""
+async def opened(options: Options, names: Collection[str] = (), *, degraded: bool = False) -> AsyncIterator[LocalRig]:
+    """A rig with the buses of these servos, or with all; `degraded`: without those whose port cannot be opened. Raises
+    UnknownName before a port is opened, and DeviceError when a servo did not confirm how it was left."""
     config = options.load()
     full = [full_name(config.names, name) for name in names]
     buses = dict.fromkeys(config.names[name][0] for name in full)
-    if options.dry_run:
-        click.echo("dry run: on simulated servos, no port is opened", err=True)
-    async with open_rig(config, buses=list(buses), trace=tracer(config, options)) as rig:
+    async with traced(config, options) as trace, open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
         yield rig
 
 
-def tracer(config: Config, options: Options) -> Trace | None:
-    """Prints frames in words. A dry run prints what would be sent, on standard output unless that is JSON."""
+@asynccontextmanager
+async def traced(config: Config, options: Options) -> AsyncIterator[Trace | None]:
+    """What prints frames in words, if that is wanted. A dry run prints what would be sent, on standard output unless that is
+    JSON."""
+    if options.dry_run:
+        click.echo("dry run: on simulated servos, no port is opened", err=True)
     if not (options.trace or options.dry_run):
-        return None
+        yield None
+        return
     codecs = {name: PROTOCOLS[bus.protocol].codec() for name, bus in config.buses.items()}
-    started: list[float] = []
-
-    def trace(bus: str, sent: bool, data: bytes, now: float) -> None:
-        if not started:
-            started.append(now)
-        if not sent and not options.trace:
-            return
-        codec = codecs[bus]
-        codec.reset()
-        codec.receive_data(data)
-        frames = []
-        while (reply := codec.next_reply()) is not None:
-            frames.append(reply.frame)
-        for frame in frames or [data]:
-            words = codec.describe(frame, sent=sent)
-            line = f"{now - started[0]:9.4f} {bus} {'>' if sent else '<'} {frame.hex(' ')}   {words}"
-            click.echo(line, err=options.trace or options.as_json)
-
-    return trace
+    tracer = Tracer(codecs, partial(click.echo, err=options.trace or options.as_json), heard=options.trace)
+    try:
+        yield tracer
+    finally:
+        tracer.close()
 
 
 def run(main: Callable[[], Coroutine[Any, Any, R]], *, terminated: int = 128 + signal.SIGTERM) -> R:
-    """Run it on the fastest loop there is. Ctrl-C and SIGTERM end it in order, so that exit policies are applied; after
-    SIGTERM the status is `terminated`."""
+    """Run it on the fastest loop there is. Ctrl-C, SIGTERM and a terminal that is closed end it in order, so that exit policies
+    are applied; the status is 130 after the first, `terminated` after the others."""
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_until_terminated(main, terminated))
 
@@ -136,10 +140,11 @@ async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: 
     def terminate() -> None:
         if received:
             os._exit(status)  # asked for a second time: at once
-        received.append(signal.SIGTERM)
+        received.append(status)
         task.cancel()
 
-    loop.add_signal_handler(signal.SIGTERM, terminate)
+    for number in ENDINGS:
+        loop.add_signal_handler(number, terminate)
     try:
         return await main()
     except asyncio.CancelledError:
@@ -147,7 +152,8 @@ async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: 
             raise SystemExit(status) from None
         raise
     finally:
-        loop.remove_signal_handler(signal.SIGTERM)
+        for number in ENDINGS:
+            loop.remove_signal_handler(number)
 
 
 def logs(level: int = logging.WARNING) -> None:
@@ -157,7 +163,7 @@ def logs(level: int = logging.WARNING) -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
+            structlog.dev.ConsoleRenderer(colors="NO_COLOR" not in os.environ) if terminal else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(level),
         logger_factory=structlog.WriteLoggerFactory(sys.stderr),

@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from servobus.config import parse_config
-from servobus.doors.cli.common import echo_table, emit, logs, run
+from servobus.doors.cli.common import Number, echo_table, emit, logs, run
 from servobus.doors.cli.offline import loads_of
 from servobus.errors import ServobusError
 from servobus.local import LocalRig, open_rig
@@ -56,7 +56,7 @@ class Tally:
 
 
 @click.command()
-@click.option("--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5, 3600), help="How long to stream.")
+@click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="How long to stream.")
 @click.option("--json", "as_json", is_flag=True, help="For machines.")
 def demo(seconds: float, as_json: bool) -> int:
     """Stream goals to ten simulated servos on two lines with real wire time, and print what the lines carried.

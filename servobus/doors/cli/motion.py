@@ -4,15 +4,21 @@ leaves it again: what it enabled is then left as the servo's `on_exit` says.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Iterable
 
 import click
 
-from servobus.doors.cli.common import Options, echo_table, emit, logs, opened, run, servo_options
-from servobus.errors import LimitError, NotSupported
-from servobus.local import LocalRig
+from servobus.bus.limits import check_goal
+from servobus.config import Config
+from servobus.doors.cli.common import Number, Options, echo_table, emit, logs, opened, run, servo_options
+from servobus.errors import LimitError, NotSupported, ServobusError
+from servobus.protocols.base import Goal, ServoGoal
+from servobus.protocols.table import PROTOCOLS
+from servobus.rig import full_name
 
 NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
+THEN = {"hold": "holds (on_exit)", "limp": "goes limp (on_exit)", "park": "parks, then goes limp (on_exit)"}
+"""What an exit policy leaves, in words."""
 
 
 @click.command()
@@ -21,7 +27,7 @@ NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
 @click.option("--duration", type=float, help="Seconds the way shall take, instead of a speed.")
 @click.option("--together", is_flag=True, help="All begin at the same moment, or none does.")
 @click.option("--confirm", is_flag=True, help="Every servo acknowledges before any moves.")
-@click.option("--timeout", default=10.0, show_default=True, type=click.FloatRange(min=0), help="Seconds to arrive within.")
+@click.option("--timeout", default=10.0, show_default=True, type=Number(min=0), help="Seconds to arrive within.")
 @servo_options
 def move(
     options: Options,
@@ -34,12 +40,13 @@ def move(
 ) -> int:
     """Enable servos, move them, wait until they stand, and leave them as their `on_exit` says.
 
-    Positions in each servo's unit.
+    Positions in each servo's unit (degrees if it names none). What a limit forbids is refused before a port is opened. Ctrl-C
+    stops the motion by the same `on_exit`.
 
     Example: servobus move shoulder=10 elbow=-20 --speed 30
     """
     logs()
-    goals = dict(_target(text) for text in targets)
+    goals = _goals(options.load(), targets, speed, duration)
 
     async def main() -> int:
         async with opened(options, list(goals)) as rig:
@@ -47,16 +54,36 @@ def move(
             await rig.move(goals, together=together, confirm=confirm, speed=speed, duration=duration)
             states = await rig.settle(*goals, timeout=timeout)
             if options.as_json:
-                emit({name: {"position": state.position} for name, state in states.items()})
+                emit({name: {"position": state.position, "then": _on_exit(rig.config, name)} for name, state in states.items()})
             else:
                 echo_table(
                     None,
                     ("servo", "position", "then"),
-                    [(name, state.position, _left(rig, name)) for name, state in states.items()],
+                    [(name, state.position, THEN[_on_exit(rig.config, name)]) for name, state in states.items()],
                 )
             return 0
 
     return run(main)
+
+
+def _goals(config: Config, targets: Iterable[str], speed: float | None, duration: float | None) -> dict[str, float]:
+    """Full name -> position. Refuses what no servo of that kind may do while nothing is energised yet: LimitError, UnknownName,
+    NotSupported."""
+    goals: dict[str, float] = {}
+    for text in targets:
+        said, position = _target(text)
+        name = full_name(config.names, said)
+        if name in goals:
+            raise click.BadParameter(f"{name} is named twice: give each servo one position", param_hint="NAME=POSITION")
+        goals[name] = position
+        bus, servo = config.names[name]
+        options = config.buses[bus]
+        try:
+            goal = check_goal(servo, Goal("position", position, speed, duration), servos_of(options)[servo], None)
+            PROTOCOLS[options.protocol].driver(options, config.models[bus]).check_goal(ServoGoal(servo, goal))
+        except ServobusError as error:
+            raise error.at(bus=bus) from None
+    return goals
 
 
 def _target(text: str) -> tuple[str, float]:
@@ -69,11 +96,10 @@ def _target(text: str) -> tuple[str, float]:
         raise LimitError(f"{text}: {position!r} is no number: nothing was sent") from None
 
 
-def _left(rig: LocalRig, name: str) -> str:
+def _on_exit(config: Config, name: str) -> str:
     """What becomes of it when this command ends."""
-    bus, servo = rig.names[name]
-    policy = rig.config.buses[bus].servos[servo].on_exit
-    return {"hold": "holds", "limp": "goes limp", "park": "parks, then goes limp"}[policy] + " (on_exit)"
+    bus, servo = config.names[name]
+    return servos_of(config.buses[bus])[servo].on_exit
 
 
 @click.command()
@@ -93,9 +119,9 @@ def enable(options: Options, names: tuple[str, ...]) -> int:
             await rig.enable(*names)
             done = rig.full_names(names)
             if options.as_json:
-                emit({name: {"enabled": True} for name in done})
+                emit({name: {"enabled": True, "then": _on_exit(rig.config, name)} for name in done})
             else:
-                echo_table(None, ("servo", "state", "then"), [(name, "enabled", _left(rig, name)) for name in done])
+                echo_table(None, ("servo", "state", "then"), [(name, "enabled", THEN[_on_exit(rig.config, name)]) for name in done])
             return 0
 
     return run(main)
@@ -129,12 +155,14 @@ def disable(options: Options, names: tuple[str, ...]) -> int:
 def stop(options: Options) -> int:
     """E-stop: every servo of every bus stops as its `on_estop` says; what was limp stays limp. Tells what each confirmed.
 
+    A bus whose port cannot be opened does not keep the others from being stopped. Status 1 unless all confirmed.
+
     Example: servobus stop
     """
     logs()
 
     async def main() -> int:
-        async with opened(options) as rig:
+        async with opened(options, degraded=True) as rig:
             reports = await rig.stop()
             click.echo(NOT_LATCHED, err=True)
             if options.as_json:
@@ -145,13 +173,9 @@ def stop(options: Options) -> int:
                     for name, report in reports.items()
                 ]
                 echo_table(None, ("servo", "action", "written", "confirmed", "detail"), rows)
-            return 0 if _all_confirmed([report.confirmed for report in reports.values()]) else 1
+            return 0 if all(report.confirmed for report in reports.values()) else 1
 
     return run(main)
-
-
-def _all_confirmed(confirmed: Collection[bool]) -> bool:
-    return all(confirmed)
 
 
 @click.command()

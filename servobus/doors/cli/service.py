@@ -11,7 +11,7 @@ import click
 import structlog
 
 from servobus.config import load_config
-from servobus.doors.cli.common import logs
+from servobus.doors.cli.common import Number, logs
 from servobus.doors.cli.common import run as run_loop
 from servobus.local import LocalRig, open_rig
 from servobus.sim.serve import serve
@@ -22,7 +22,7 @@ log = structlog.get_logger("servobus")
 @click.command()
 @click.argument("config", metavar="CONFIG")
 @click.option(
-    "--log-every", default=10.0, show_default=True, type=click.FloatRange(min=0.1), help="Seconds between two lines of state."
+    "--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between two lines of state."
 )
 def run(config: str, log_every: float) -> None:
     """Own the ports of CONFIG until SIGTERM or Ctrl-C.

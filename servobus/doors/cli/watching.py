@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 from rich.live import Live
 
-from servobus.doors.cli.common import STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, state_row, table
+from servobus.doors.cli.common import Number, STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, state_row, table
 from servobus.local import LocalRig
 from servobus.rig import Snapshot
 
@@ -19,7 +19,7 @@ MOST_HZ = 50.0
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--hz", default=10.0, show_default=True, type=click.FloatRange(0.1, MOST_HZ), help="Pictures per second.")
+@click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MOST_HZ), help="Pictures per second.")
 @click.option("--count", type=click.IntRange(min=1), help="Stop after so many.")
 @servo_options
 def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None) -> int:
@@ -61,7 +61,7 @@ async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | Non
 
 
 @click.command()
-@click.option("--seconds", default=2.0, show_default=True, type=click.FloatRange(0.1, 3600), help="How long to count.")
+@click.option("--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="How long to count.")
 @servo_options
 def stats(options: Options, seconds: float) -> int:
     """Poll as the config says for a while, and tell what the lines carried and how long turns took.
