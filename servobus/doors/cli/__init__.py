@@ -79,6 +79,9 @@ def status_of(arguments: list[str] | None = None) -> int:
     except ServobusError as error:
         click.echo(f"servobus: {error}", err=True)
         return error.exit_status
+    except OSError as error:
+        click.echo(f"servobus: {error}", err=True)
+        return ServobusError.exit_status
     except (KeyboardInterrupt, click.Abort):
         return INTERRUPTED
     return result if isinstance(result, int) else 0

@@ -14,7 +14,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,7 +47,7 @@ class Number(click.FloatRange):
         return number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Options:
     """What every command on servos takes."""
 
@@ -56,7 +56,8 @@ class Options:
     trace: bool
     dry_run: bool
 
-    def load(self) -> Config:
+    @cached_property
+    def setup(self) -> Config:
         """The config; on simulated servos when nothing shall be sent. Raises ConfigError."""
         if self.config is None and not Path(DEFAULT_CONFIG).exists():
             raise ConfigError(
@@ -92,7 +93,7 @@ def simulated(config: Config) -> Config:
 async def opened(options: Options, names: Collection[str] = (), *, degraded: bool = False) -> AsyncIterator[LocalRig]:
     """A rig with the buses of these servos, or with all; `degraded`: without those whose port cannot be opened. Raises
     UnknownName before a port is opened, and DeviceError when a servo did not confirm how it was left."""
-    config = options.load()
+    config = options.setup
     full = [full_name(config.names, name) for name in names]
     buses = dict.fromkeys(config.names[name][0] for name in full)
     async with traced(config, options) as trace, open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
@@ -163,7 +164,9 @@ def logs(level: int = logging.WARNING) -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer(colors="NO_COLOR" not in os.environ) if terminal else structlog.processors.JSONRenderer(),
+            structlog.dev.ConsoleRenderer(colors="NO_COLOR" not in os.environ)
+            if terminal
+            else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(level),
         logger_factory=structlog.WriteLoggerFactory(sys.stderr),

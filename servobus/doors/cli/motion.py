@@ -46,7 +46,7 @@ def move(
     Example: servobus move shoulder=10 elbow=-20 --speed 30
     """
     logs()
-    goals = _goals(options.load(), targets, speed, duration)
+    goals = _goals(options.setup, targets, speed, duration)
 
     async def main() -> int:
         async with opened(options, list(goals)) as rig:
@@ -79,7 +79,7 @@ def _goals(config: Config, targets: Iterable[str], speed: float | None, duration
         bus, servo = config.names[name]
         options = config.buses[bus]
         try:
-            goal = check_goal(servo, Goal("position", position, speed, duration), servos_of(options)[servo], None)
+            goal = check_goal(servo, Goal("position", position, speed, duration), options.servos[servo], None)
             PROTOCOLS[options.protocol].driver(options, config.models[bus]).check_goal(ServoGoal(servo, goal))
         except ServobusError as error:
             raise error.at(bus=bus) from None
@@ -99,7 +99,7 @@ def _target(text: str) -> tuple[str, float]:
 def _on_exit(config: Config, name: str) -> str:
     """What becomes of it when this command ends."""
     bus, servo = config.names[name]
-    return servos_of(config.buses[bus])[servo].on_exit
+    return config.buses[bus].servos[servo].on_exit
 
 
 @click.command()
@@ -121,7 +121,9 @@ def enable(options: Options, names: tuple[str, ...]) -> int:
             if options.as_json:
                 emit({name: {"enabled": True, "then": _on_exit(rig.config, name)} for name in done})
             else:
-                echo_table(None, ("servo", "state", "then"), [(name, "enabled", THEN[_on_exit(rig.config, name)]) for name in done])
+                echo_table(
+                    None, ("servo", "state", "then"), [(name, "enabled", THEN[_on_exit(rig.config, name)]) for name in done]
+                )
             return 0
 
     return run(main)
@@ -185,5 +187,5 @@ def clear(options: Options) -> int:
 
     Example: servobus clear
     """
-    options.load()
-    raise NotSupported("there is no e-stop to release: no daemon runs (`servobus run`), and without one nothing is latched")
+    buses = ", ".join(options.setup.buses)
+    raise NotSupported(f"no e-stop is latched on {buses}: no daemon runs (`servobus run`), and only a daemon latches one")

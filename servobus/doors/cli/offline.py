@@ -12,7 +12,7 @@ from servobus.doors.cli.common import echo_table, emit
 from servobus.errors import ConfigError, UnknownName
 from servobus.links import open_link
 from servobus.links.ports import list_ports
-from servobus.protocols.base import LineTraits
+from servobus.protocols.base import Codec, LineTraits
 from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
 from servobus.sim.build import SIMULATED
@@ -96,37 +96,56 @@ def schema() -> None:
 
 @click.command()
 @click.argument("hex_bytes", metavar="HEX...", nargs=-1, required=True)
-@click.option("--protocol", default="sms", show_default=True, help="Whose frame it is.")
+@click.option("--protocol", default="sms", show_default=True, help="Whose frames they are.")
+@click.option("--request", "only", flag_value="request", help="Only as what a master says.")
+@click.option("--reply", "only", flag_value="reply", help="Only as what a servo answers.")
 @click.option("--json", "as_json", is_flag=True, help="For machines.")
-def decode(hex_bytes: tuple[str, ...], protocol: str, as_json: bool) -> None:
-    """Tell what a frame says, as a request and as a reply (many look like both).
+def decode(hex_bytes: tuple[str, ...], protocol: str, only: str | None, as_json: bool) -> None:
+    """Tell what a frame, or several in a row, say: as a request and as a reply, since many look like both.
 
     Example: servobus decode FF FF 01 02 01 FB
     """
     if protocol not in PROTOCOLS:
         raise UnknownName(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
-    text = " ".join(hex_bytes).replace("0x", " ").replace(",", " ").replace(":", " ")
-    try:
-        frame = bytes.fromhex(text)
-    except ValueError:
-        raise click.BadParameter(
-            f"{text!r} is no hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX"
-        ) from None
-    codec = PROTOCOLS[protocol].codec()
-    words = {"request": codec.describe(frame, sent=True), "reply": codec.describe(frame, sent=False)}
+    entry, data = PROTOCOLS[protocol], _bytes_of(" ".join(hex_bytes))
+    codecs = {"request": entry.device_codec(), "reply": entry.codec()}
+    words = {kind: _in_words(codec, data, kind) for kind, codec in codecs.items() if only in (None, kind)}
     if as_json:
-        emit({"frame": frame.hex(" "), **words})
-    elif words["request"] == words["reply"]:
-        click.echo(words["request"])
+        emit({"frame": data.hex(" "), **words})
+    elif len(set(words.values())) == 1:
+        click.echo(next(iter(words.values())))
     else:
         for kind, line in words.items():
             click.echo(f"as a {kind}: {line}")
 
 
+def _in_words(codec: Codec, data: bytes, kind: str) -> str:
+    """Of each frame; of the whole where it is not frames from end to end."""
+    codec.receive_data(data)
+    frames = []
+    while (reply := codec.next_reply()) is not None:
+        frames.append(reply.frame)
+    pieces = frames if b"".join(frames) == data else [data]
+    return " | ".join(codec.describe(piece, sent=kind == "request") for piece in pieces)
+
+
+def _bytes_of(text: str) -> bytes:
+    for separator in ("0x", "0X", "\\x", ",", ":"):
+        text = text.replace(separator, " ")
+    try:
+        data = bytes.fromhex(text)
+    except ValueError:
+        data = b""
+    if not data:
+        raise click.BadParameter(f"{text!r} is no hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX")
+    return data
+
+
 @click.command()
 @click.option("--json", "as_json", is_flag=True, help="For machines.")
 def ports(as_json: bool) -> None:
-    """List the serial ports of this machine: the name to put into a config, what it is, and who holds it.
+    """List the serial ports of this machine: the name to put into a config (it belongs to the adapter), the name of the socket
+    it is plugged into, what it is, and who holds it.
 
     Example: servobus ports
     """
@@ -136,8 +155,8 @@ def ports(as_json: bool) -> None:
     elif not found:
         click.echo("no serial ports; is the adapter plugged in?")
     else:
-        rows = [(port.by_id or port.device, port.device, port.description, _held_by(port.holder)) for port in found]
-        echo_table(None, ("port", "device", "description", "held by"), rows)
+        rows = [(port.by_id or port.device, port.device, port.by_path, port.description, _held_by(port.holder)) for port in found]
+        echo_table(None, ("port", "device", "by socket", "description", "held by"), rows)
 
 
 def _held_by(holder: tuple[int, str] | None) -> str | None:

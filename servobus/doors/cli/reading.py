@@ -25,7 +25,7 @@ def ping(options: Options, names: tuple[str, ...]) -> int:
     async def main() -> int:
         async with opened(options, names) as rig:
             answers = await _each(rig, names, rig.ping)
-            failed = {name: str(answer) for name, answer in answers.items() if isinstance(answer, ServobusError)}
+            failed = {name: answer.message for name, answer in answers.items() if isinstance(answer, ServobusError)}
             if options.as_json:
                 emit(
                     {name: {"error": failed[name]} if name in failed else {"status": answer} for name, answer in answers.items()}
@@ -90,7 +90,7 @@ async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) 
     answers = await _each(rig, names, rig.read)
     failed = {name: answer for name, answer in answers.items() if isinstance(answer, ServobusError)}
     if options.as_json:
-        emit({name: {"error": str(answer)} if name in failed else answer for name, answer in answers.items()})
+        emit({name: {"error": answer.message} if name in failed else answer for name, answer in answers.items()})
         return 1 if failed else 0
     rows = [state_row(name, state) for name, state in answers.items() if name not in failed]
     if rows:

@@ -16,15 +16,17 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
 from servobus.config import Config, parse_config
-from servobus.doors.cli.common import Options, echo_table, emit, logs, run, servo_options, simulated, tracer
-from servobus.errors import ConfigError, UnknownName
+from servobus.doors.cli.common import Options, echo_table, emit, logs, run, servo_options, simulated, traced
+from servobus.errors import ServobusError, UnknownName
 from servobus.local import open_rig
 from servobus.protocols.table import PROTOCOLS
 from servobus.rig import Found
 
 INTERRUPTED, NONE_FOUND = 130, 1
+LEAST_RATE, GREATEST_RATE = 300, 10_000_000
 BUS = "line"
 """What the bus of a bare port is called."""
+HEAD = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
 
 
 @click.command()
@@ -46,14 +48,21 @@ def scan(
 
     Example: servobus scan --port /dev/ttyUSB0 --protocol sms --baudrate 1000000,115200 --ids 1-20
     """
+    if port and bus:
+        raise click.UsageError(f"say a bus of the config ({bus}) or --port, not both")
     logs()
-    config = _bare(port, protocol, rates) if port else options.load()
+    config = _bare(port, protocol, rates) if port else options.setup
     if port and options.dry_run:
         config = simulated(config)
     name = _bus_name(config, BUS if port else bus)
-    known = PROTOCOLS[config.buses[name].protocol].baudrates
+    entry = PROTOCOLS[config.buses[name].protocol]
     found: list[Found] = []
-    status = _scan(options, config, name, _rates(rates, known, bool(port)), _ids(ids), found)
+    try:
+        status = _scan(options, config, name, _rates(rates, entry.baudrates, bool(port)), _ids(ids, entry.scan_ids), found)
+    except ServobusError:
+        if found:
+            _tell(options, config, name, found, as_yaml)
+        raise
     _tell(options, config, name, found, as_yaml)
     return status or (0 if found else NONE_FOUND)
 
@@ -62,7 +71,7 @@ def _scan(options: Options, config: Config, name: str, rates: list[int], ids: li
     """Fills `found`; returns the status of an interrupted scan, else 0."""
 
     async def main() -> None:
-        async with open_rig(config, buses=[name], trace=tracer(config, options)) as rig:
+        async with traced(config, options) as trace, open_rig(config, buses=[name], trace=trace) as rig:
             with _progress() as told:
 
                 def progress(asked: int, count: int, hit: Found | None) -> None:
@@ -123,16 +132,18 @@ def _rates(text: str | None, known: tuple[int, ...], bare: bool) -> list[int]:
     if text is None:
         return []
     try:
-        rates = [int(part) for part in text.split(",")]
+        rates = list(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
         rates = []
-    if not rates or min(rates) <= 0:
-        raise click.BadParameter(f"{text!r}: write rates like 1000000,115200, or all", param_hint="--baudrate")
+    if not rates or min(rates) < LEAST_RATE or max(rates) > GREATEST_RATE:
+        raise click.BadParameter(
+            f"{text!r}: write rates from {LEAST_RATE} to {GREATEST_RATE} like 1000000,115200, or all", param_hint="--baudrate"
+        )
     return rates
 
 
-def _ids(text: str | None) -> list[int]:
-    """The ids to ask; none: every one."""
+def _ids(text: str | None, known: range) -> list[int]:
+    """The ids to ask; none: every one. Not those that mean everybody: their answers would collide."""
     if text is None:
         return []
     first, dash, last = text.partition("-")
@@ -140,41 +151,45 @@ def _ids(text: str | None) -> list[int]:
         low, high = int(first, 0), int(last, 0) if dash else int(first, 0)
     except ValueError:
         low, high = 1, 0
-    if not 0 <= low <= high <= 255:
-        raise click.BadParameter(f"{text!r}: write ids like 1-20, or 5", param_hint="--ids")
+    if not known[0] <= low <= high <= known[-1]:
+        raise click.BadParameter(f"{text!r}: write ids from {known[0]} to {known[-1]} like 1-20, or 5", param_hint="--ids")
     return list(range(low, high + 1))
 
 
 def _tell(options: Options, config: Config, name: str, found: list[Found], as_yaml: bool) -> None:
     if options.as_json:
         emit([dataclasses.asdict(hit) for hit in found])
+    elif not found:
+        click.echo("nobody answered: is the power on, are the baud rates right, is another program on the line?", err=True)
     elif as_yaml:
         click.echo(_starter(config, name, found), nl=False)
-    elif found:
+    else:
         rows = [(hit.id, hit.baudrate, hit.model, hit.product, hit.firmware, hit.note or None) for hit in found]
         echo_table(None, ("id", "baud rate", "model", "product", "firmware", "note"), rows)
-    else:
-        click.echo("nobody answered: is the power on, are the baud rates right, is another program on the line?", err=True)
 
 
 def _starter(config: Config, name: str, found: list[Found]) -> str:
-    """A config of what was found, one bus for each rate; `check` accepts it."""
-    if not found:
-        raise ConfigError("nothing was found, so there is nothing to write a config of")
+    """A config of what was found, that `check` accepts. A line has one rate, and a servo needs a model: what stands against
+    that is told in comments."""
     options = config.buses[name]
-    buses = CommentedMap()
-    for rate in dict.fromkeys(hit.baudrate for hit in found):
-        bus = CommentedMap(protocol=options.protocol, port=options.port, baudrate=rate, poll=CommentedMap(feedback=20))
-        servos = CommentedMap()
-        for hit in found:
-            if hit.baudrate == rate:
-                servos[f"servo_{hit.id}"] = CommentedMap(id=hit.id, **({"model": hit.model} if hit.model else {}))
-                servos[f"servo_{hit.id}"].fa.set_flow_style()
-        bus["poll"].fa.set_flow_style()
-        bus["servos"] = servos
-        buses[name if not buses else f"{name}_{rate}"] = bus
+    rate = max((hit.baudrate for hit in found), key=lambda rate: sum(hit.baudrate == rate for hit in found))
+    usable = [hit for hit in found if hit.baudrate == rate and hit.model]
+    servos = CommentedMap((f"servo_{hit.id}", CommentedMap(id=hit.id, model=hit.model)) for hit in usable)
+    for servo in servos.values():
+        servo.fa.set_flow_style()
+    bus = CommentedMap(protocol=options.protocol, port=options.port, baudrate=rate, poll=CommentedMap(feedback=20), servos=servos)
+    bus["poll"].fa.set_flow_style()
+    if not servos:
+        servos.fa.set_flow_style()
     text = io.StringIO()
-    YAML().dump(CommentedMap(version=1, buses=buses), text)
-    note = "" if len(buses) == 1 else "# Several rates on one line: set all servos to one, then keep one bus\n"
-    head = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
-    return f"{head}{note}{text.getvalue()}"
+    YAML().dump(CommentedMap(version=1, buses=CommentedMap({name: bus})), text)
+    notes = "".join(
+        f"# Not in it: id {hit.id} at {hit.baudrate} baud, {_why_not(hit, rate)}\n" for hit in found if hit not in usable
+    )
+    return f"{HEAD}{notes}{text.getvalue()}"
+
+
+def _why_not(hit: Found, rate: int) -> str:
+    if hit.baudrate != rate:
+        return f"{hit.model or 'unknown model'}: a line has one rate, and most servos here answer at {rate}"
+    return f"no model file fits it ({hit.note or hit.product or 'it does not say who it is'}): name one, or write your own"

@@ -21,9 +21,7 @@ log = structlog.get_logger("servobus")
 
 @click.command()
 @click.argument("config", metavar="CONFIG")
-@click.option(
-    "--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between two lines of state."
-)
+@click.option("--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between two lines of state.")
 def run(config: str, log_every: float) -> None:
     """Own the ports of CONFIG until SIGTERM or Ctrl-C.
 

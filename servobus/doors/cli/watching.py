@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import click
 from rich.console import Console
 from rich.live import Live
 
-from servobus.doors.cli.common import Number, STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, state_row, table
+from servobus.doors.cli.common import (
+    STATE_COLUMNS,
+    Number,
+    Options,
+    echo_table,
+    emit,
+    logs,
+    opened,
+    run,
+    servo_options,
+    show,
+    state_row,
+    table,
+)
 from servobus.local import LocalRig
 from servobus.rig import Snapshot
 
@@ -20,12 +35,14 @@ MOST_HZ = 50.0
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MOST_HZ), help="Pictures per second.")
-@click.option("--count", type=click.IntRange(min=1), help="Stop after so many.")
+@click.option("--count", type=click.IntRange(min=1), help="Stop after so many pictures.")
+@click.option("--seconds", type=Number(0.1), help="Stop after so long.")
 @servo_options
-def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None) -> int:
+def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None, seconds: float | None) -> int:
     """Show what the servos do, live, until Ctrl-C. Servos that the config does not poll are read at --hz.
 
-    On a terminal a table; otherwise, and with --json, one JSON line a picture.
+    Positions in the servo's unit, speed in unit/s. On a terminal a table; otherwise one line for each servo and picture; with
+    --json one JSON document a line, for each picture.
 
     Example: servobus monitor --hz 5
     """
@@ -33,28 +50,43 @@ def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | No
 
     async def main() -> int:
         async with opened(options, names) as rig:
-            shown = rig.full_names(names)
-            if options.as_json or not sys.stdout.isatty():
-                await _pictures(rig, shown, hz, count, emit)
+            shown, most = rig.full_names(names), _most(hz, count, seconds)
+            if options.as_json:
+                await _pictures(rig, shown, hz, most, emit)
+            elif not sys.stdout.isatty():
+                await _pictures(rig, shown, hz, most, _lines)
             else:
                 with Live(console=Console(), auto_refresh=False, screen=False) as live:
-                    await _pictures(rig, shown, hz, count, lambda snapshot: live.update(_picture(snapshot), refresh=True))
+                    await _pictures(rig, shown, hz, most, lambda snapshot: live.update(_picture(snapshot), refresh=True))
             return 0
 
     return run(main)
+
+
+def _most(hz: float, count: int | None, seconds: float | None) -> int | None:
+    """How many pictures; None: no end."""
+    limits = [limit for limit in (count, seconds and math.ceil(seconds * hz)) if limit]
+    return min(limits, default=None)
+
+
+def _lines(snapshot: Snapshot) -> None:
+    """What is known, in one line for each servo."""
+    for name, state in snapshot.items():
+        cells = zip(STATE_COLUMNS[1:], state_row(name, state)[1:], strict=True)
+        click.echo(f"{name}  " + "  ".join(f"{column.replace(' ', '')}={show(cell)}" for column, cell in cells))
 
 
 def _picture(snapshot: Snapshot) -> Any:
     return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()])
 
 
-async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, show: Any) -> None:
+async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, tell: Callable[[Snapshot], None]) -> None:
     unpolled = [name for name in names if not rig.config.buses[rig.names[name][0]].poll.rates()]
     taken = 0
     async for _ in rig.watch(hz):
         await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
         snapshot = rig.snapshot()
-        show({name: snapshot[name] for name in names})
+        tell({name: snapshot[name] for name in names})
         taken += 1
         if taken == count:
             return

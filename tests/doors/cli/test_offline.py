@@ -28,7 +28,9 @@ def test_check_tells_the_load(good: Path, capsys: pytest.CaptureFixture[str]) ->
     assert status_of(["check", str(good), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found["arm"]) == {"load_percent", "goal_latency_ms", "estop_latency_ms", "silent_servo_ms"}
-    assert found["arm"]["load_percent"]["total"] == pytest.approx(sum(v for k, v in found["arm"]["load_percent"].items() if k != "total"), abs=0.1)
+    assert found["arm"]["load_percent"]["total"] == pytest.approx(
+        sum(v for k, v in found["arm"]["load_percent"].items() if k != "total"), abs=0.1
+    )
 
 
 @pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
@@ -75,6 +77,13 @@ def test_decode(form: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == "as a request: id 1 PING\nas a reply: id 1 status 0x01\n"
 
 
+def test_decode_one_side_only_and_several_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status_of(["decode", "--request", "FFFF010201FB FFFFFE0205FA"]) == 0
+    assert capsys.readouterr().out == "id 1 PING | all ACTION\n"
+    assert status_of(["decode", "--reply", "FFFF010201FB", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"frame": "ff ff 01 02 01 fb", "reply": "id 1 status 0x01"}
+
+
 def test_decode_for_machines(capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(["decode", "FF FF FE 02 05 FA", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["request"] == "all ACTION"
@@ -84,6 +93,8 @@ def test_decode_of_what_is_no_frame(capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(["decode", "01 02"]) == 0
     assert "no SMS packet" in capsys.readouterr().out
     assert status_of(["decode", "xyz"]) == 2
+    assert "no hexadecimal text" in capsys.readouterr().err
+    assert status_of(["decode", ","]) == 2
     assert "no hexadecimal text" in capsys.readouterr().err
     assert status_of(["decode", "FF", "--protocol", "abc"]) == 2
     assert "there are sms" in capsys.readouterr().err

@@ -78,10 +78,17 @@ def test_move(call: Call) -> None:
     assert "holds (on_exit)" in call.out
 
 
+def test_what_a_limit_forbids_energises_nothing(call: Call) -> None:
+    assert call("move", "elbow=5", "shoulder=90.1", "--trace") == 2
+    assert call("move", "arm/elbow=5", "shoulder=90.1", "--trace") == 2
+    assert "arm/shoulder: position 90.1 is outside -90 to 90: nothing was sent" in call.err
+    assert ">" not in call.err
+
+
 def test_enable_disable(call: Call) -> None:
     assert call("enable", "shoulder") == 0
     assert "arm/shoulder  enabled  holds (on_exit)" in call.out
-    assert call.json("enable", "shoulder") == {"arm/shoulder": {"enabled": True}}
+    assert call.json("enable", "shoulder") == {"arm/shoulder": {"enabled": True, "then": "hold"}}
     assert call("disable") == 0
     assert call.out.count("limp") == 4
     assert call.json("disable", "shoulder") == {"arm/shoulder": {"enabled": False}}
@@ -97,9 +104,14 @@ def test_stop_and_clear_without_a_daemon(call: Call) -> None:
 
 
 def test_monitor_and_stats(call: Call) -> None:
-    assert call("monitor", "shoulder", "--count", "2", "--hz", "50") == 0
-    lines = [json.loads(line) for line in call.out.splitlines()]
-    assert [list(line) for line in lines] == [["arm/shoulder"]] * 2
+    assert call("monitor", "shoulder", "--count", "2", "--hz", "50", "--json") == 0
+    pictures = [json.loads(line) for line in call.out.splitlines()]
+    assert [list(picture) for picture in pictures] == [["arm/shoulder"]] * 2
+    assert call("monitor", "arm/shoulder", "hip", "--seconds", "0.1", "--hz", "10") == 0
+    assert [line.split()[:2] for line in call.out.splitlines()] == [
+        ["arm/shoulder", "position=0.00"],
+        ["leg/hip", "position=0.00"],
+    ]
     found = call.json("stats", "--seconds", "0.2")
     assert found["arm"]["up"] is True
     assert found["leg"]["nodes"]["1"]["health"] == "online"
@@ -109,7 +121,10 @@ def test_monitor_and_stats(call: Call) -> None:
 
 def test_scan(call: Call, tmp_path: Path) -> None:
     found = call.json("scan", "arm", "--ids", "0-3")
-    assert [(hit["bus"], hit["id"], hit["baudrate"], hit["model"]) for hit in found] == [("arm", 1, 1000000, "sts"), ("arm", 2, 1000000, "sts")]
+    assert [(hit["bus"], hit["id"], hit["baudrate"], hit["model"]) for hit in found] == [
+        ("arm", 1, 1000000, "sts"),
+        ("arm", 2, 1000000, "sts"),
+    ]
     assert all(hit["firmware"] for hit in found)
     assert call("scan", "arm", "--ids", "1-2") == 0
     assert "STS3215" in call.out
@@ -124,8 +139,8 @@ def test_scan_that_finds_nobody(call: Call) -> None:
     assert call.out == "[]\n"
     assert call("scan", "arm", "--ids", "200") == 1
     assert "nobody answered" in call.err
-    assert call("scan", "arm", "--ids", "200", "--yaml") == 2
-    assert "nothing was found" in call.err
+    assert call("scan", "arm", "--ids", "200", "--yaml") == 1
+    assert call.out == ""
 
 
 def test_scan_of_a_bare_port(call: Call) -> None:
@@ -139,11 +154,14 @@ def test_scan_of_a_bare_port(call: Call) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--ids", "5-1"), "write ids like"),
-        (("--ids", "256"), "write ids like"),
-        (("--ids", "x"), "write ids like"),
-        (("--baudrate", "fast"), "write rates like"),
-        (("--baudrate", "-1"), "write rates like"),
+        (("--ids", "5-1"), "write ids from 0 to 253"),
+        (("--ids", "253-254"), "write ids from 0 to 253"),
+        (("--ids", "-1"), "write ids from 0 to 253"),
+        (("--ids", "x"), "write ids from 0 to 253"),
+        (("--baudrate", "fast"), "write rates from 300 to 10000000"),
+        (("--baudrate", "299"), "write rates from 300"),
+        (("--baudrate", "10000001"), "write rates from 300"),
+        (("--port", "sim:"), "not both"),
         ((), "say which bus: there are arm, leg"),
     ],
 )
@@ -180,6 +198,15 @@ def test_scan_with_bad_arguments(arguments: tuple[str, ...], told: str, call: Ca
         (("ping", "-c", "none.yaml"), "there is no such file"),
         (("enable", "knee"), "no servo 'knee'"),
         (("monitor", "--hz", "0"), "--hz"),
+        (("monitor", "--hz", "nan"), "not a finite number"),
+        (("monitor", "--seconds", "inf"), "not a finite number"),
+        (("stats", "--seconds", "nan"), "not a finite number"),
+        (("demo", "--seconds", "nan"), "not a finite number"),
+        (("demo", "--seconds", "0.4"), "--seconds"),
+        (("move", "shoulder=5", "--timeout", "nan"), "not a finite number"),
+        (("move", "shoulder=5", "arm/shoulder=6"), "arm/shoulder is named twice"),
+        (("move", "shoulder=5", "--speed", "10", "--duration", "1"), "not both"),
+        (("move", "shoulder=5", "--speed", "nan"), "not a finite number"),
     ],
 )
 def test_what_is_refused_ends_with_status_2(arguments: tuple[str, ...], told: str, call: Call) -> None:
@@ -205,6 +232,29 @@ def test_a_port_that_is_missing_ends_with_status_1_and_touches_no_other(call: Ca
     assert call("read", "shoulder") == 1
     assert "servobus: arm: /dev/no-such-port does not exist" in call.err
     assert call("read", "hip") == 0
+
+
+def test_a_port_that_is_missing_keeps_no_other_bus_from_being_stopped(call: Call, rig: Path) -> None:
+    rig.write_text(TWO.replace('"sim:"', "/dev/no-such-port", 1).replace("hip: {", "hip: {on_estop: limp, "))
+    assert call("stop", "--json") == 1
+    reports = json.loads(call.out)
+    assert (reports["leg/hip"]["action"], reports["leg/hip"]["confirmed"]) == ("limp", True)
+    assert (reports["arm/shoulder"]["written"], reports["arm/shoulder"]["confirmed"]) == (False, False)
+    assert "/dev/no-such-port" in call.err
+
+
+def test_a_silent_servo_ends_with_status_1_and_the_others_are_told(call: Call, rig: Path) -> None:
+    rig.write_text(TWO.replace('port: "sim:"', 'port: "sim:"\n    faults: {loss: 1.0}', 1))
+    assert call("read", "--json") == 1
+    answers = json.loads(call.out)
+    assert "is it powered" in answers["arm/elbow"]["error"]
+    assert answers["leg/elbow"]["health"] == "online"
+    assert call("ping", "shoulder", "hip") == 1
+    assert "leg/hip       there" in call.out
+    assert call("enable", "shoulder", "hip") == 1
+    assert "arm/shoulder: no answer" in call.err
+    assert call("stop") == 1
+    assert "leg/hip" in call.out
 
 
 def test_trace_shows_both_ways(call: Call) -> None:

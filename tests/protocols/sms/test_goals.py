@@ -1,0 +1,283 @@
+"""How goals leave: WRITE, SYNC WRITE, or REG WRITE and ACTION, and what becomes of a servo that does not acknowledge."""
+
+from __future__ import annotations
+
+import pytest
+
+from servobus.errors import ActionWithheld, LimitError, NotSupported, ReplyTimeout
+from servobus.protocols.base import Goal, Outcome, ServoGoal
+from servobus.protocols.sms.codec import Instruction, Packet
+from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
+from tests.protocols.sms.bench import TWO, Bench
+
+MANY = {f"s{number}": {"id": number, "model": "sts"} for number in range(1, 41)}
+FLAG = 64
+
+
+def writes_of(bench: Bench, code: Instruction) -> list[Packet]:
+    return [packet for packet in bench.said if packet.code == code]
+
+
+def test_the_frame_of_the_design() -> None:
+    bench = Bench({"elbow": {"id": 2, "model": "sts", "zero": 2048, "direction": -1}})
+    bench.enable()
+    assert bench.move({"elbow": 30}) == {"elbow": Outcome.ACKED}
+    assert [packet.frame.hex(" ").upper() for packet in bench.said] == ["FF FF 02 09 03 2A AB 06 00 00 E8 03 2B"]
+    assert bench.register(2, "goal_position") == 1707
+
+
+def test_several_are_one_sync_write() -> None:
+    bench = Bench()
+    bench.enable()
+    assert bench.move({"a": 10, "b": -10}) == {"a": Outcome.SENT, "b": Outcome.SENT}
+    assert bench.instructions() == ["SYNC_WRITE"]
+    assert (bench.register(1, "goal_position"), bench.register(2, "goal_position")) == (2162, 1934)
+
+
+def test_confirm_is_reg_write_each_and_one_action() -> None:
+    bench = Bench()
+    bench.enable()
+    assert bench.move({"a": 10, "b": -10}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+    assert bench.instructions() == ["REG_WRITE", "REG_WRITE", "ACTION"]
+    assert bench.register(1, "goal_position") == 2162
+
+
+def test_confirm_of_one_is_its_acknowledged_write() -> None:
+    bench = Bench()
+    bench.enable()
+    bench.move({"a": 10}, confirm=True)
+    assert bench.instructions() == ["WRITE"]
+
+
+def test_different_spans_are_reg_write_and_action() -> None:
+    bench = Bench()
+    bench.enable()
+    goals = {"a": Goal("position", 10, acceleration=500), "b": Goal("position", 10)}
+    assert bench.move(goals) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+    assert bench.instructions() == ["REG_WRITE", "REG_WRITE", "ACTION"]
+    assert {packet.id: packet.params[0] for packet in writes_of(bench, Instruction.REG_WRITE)} == {1: 41, 2: 42}
+    bench.said.clear()
+    bench.move(goals)
+    assert bench.instructions() == ["SYNC_WRITE"], "the servo holds the acceleration now"
+
+
+@pytest.mark.parametrize(("count", "frames"), [(17, 1), (18, 2), (34, 2), (35, 3)])
+def test_sync_write_is_split_at_its_greatest_size(count: int, frames: int) -> None:
+    """128 bytes hold 8 + 17 x 7."""
+    bench = Bench(dict(list(MANY.items())[:count]))
+    bench.enable()
+    results = bench.move({name: 1.0 for name in bench.driver.nodes})
+    assert set(results.values()) == {Outcome.SENT} or frames > 1
+    assert len(results) == count
+    assert len(bench.said) == frames
+    assert all(len(packet.frame) <= 128 for packet in bench.said)
+
+
+@pytest.mark.parametrize(("baudrate", "greatest"), [(115_200, 115), (1_000_000, 128), (9600, 9)])
+def test_no_frame_holds_the_line_longer_than_allowed(baudrate: int, greatest: int) -> None:
+    bench = Bench(baudrate=baudrate)
+    assert GoalWriter(bench.options).frame_size() == greatest
+    assert greatest * 10 / baudrate <= MAX_FRAME_SECONDS
+
+
+def test_never_below_one_servo() -> None:
+    bench = Bench(baudrate=9600)
+    bench.enable()
+    assert set(bench.move({"a": 1, "b": 1}).values()) == {Outcome.ACKED}
+    assert bench.instructions() == ["WRITE", "WRITE"]
+
+
+def test_together_beyond_one_frame_is_reg_write_and_action() -> None:
+    bench = Bench(dict(list(MANY.items())[:18]))
+    bench.enable()
+    turns = bench.driver.plan(
+        [ServoGoal(name, Goal("position", 1.0)) for name in bench.driver.nodes], together=True, confirm=False
+    )
+    assert [(len(turn.servos), turn.frames) for turn in turns] == [(18, 19)]
+    assert set(bench.run(turns[0].plan).values()) == {Outcome.ACKED}
+    assert bench.instructions() == ["REG_WRITE"] * 18 + ["ACTION"]
+
+
+# A servo that does not acknowledge
+
+
+def test_action_is_withheld_and_who_was_armed_is_disarmed() -> None:
+    bench = Bench()
+    bench.enable()
+    goals = bench.register(1, "goal_position"), bench.register(2, "goal_position")
+    bench.deaf = lambda packet: packet.id == 2
+    results = bench.move({"a": 10, "b": 10}, confirm=True)
+    assert isinstance(results["a"], ActionWithheld)
+    assert "b did not acknowledge" in str(results["a"])
+    assert isinstance(results["b"], ReplyTimeout)
+    assert not any(packet.code == Instruction.ACTION and packet.id == 0xFE for packet in bench.said)
+    assert bench.register(1, "async_write_flag") == 0, "disarmed"
+    assert (bench.register(1, "goal_position"), bench.register(2, "goal_position")) == goals
+
+
+def test_one_that_took_it_and_was_not_heard_holds_back_the_next_action() -> None:
+    bench = Bench({**TWO, "c": {"id": 3, "model": "sts"}})
+    bench.enable()
+    goal = bench.register(3, "goal_position")
+    bench.mute = lambda packet: packet.id == 3
+    bench.move({"a": 10, "c": 10}, confirm=True)
+    assert bench.register(3, "async_write_flag") == 1, "it is armed, and nobody knows"
+    results = bench.move({"a": 5, "b": 5}, confirm=True)
+    assert all(
+        isinstance(result, ActionWithheld) and "id 3 may hold an older REG WRITE" in str(result) for result in results.values()
+    )
+    assert bench.register(3, "goal_position") == goal
+    bench.mute = lambda packet: False
+    assert all(isinstance(result, ActionWithheld) for result in bench.move({"a": 5, "b": 5}, confirm=True).values()), (
+        "its flag reads 1"
+    )
+    assert bench.move({"c": 1, "b": 5}, confirm=True) == {"c": Outcome.ACKED, "b": Outcome.ACKED}, "overwritten, it is no danger"
+    assert bench.move({"a": 5, "b": 5}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+
+
+def test_one_whose_flag_reads_0_is_believed() -> None:
+    bench = Bench({**TWO, "c": {"id": 3, "model": "sts"}})
+    bench.enable()
+    bench.deaf = lambda packet: packet.id == 3
+    bench.move({"a": 10, "c": 10}, confirm=True)
+    bench.deaf = lambda packet: False
+    bench.said.clear()
+    assert bench.move({"a": 5, "b": 5}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+    assert any(packet.id == 3 and packet.params == bytes((FLAG, 1)) for packet in bench.said)
+
+
+def test_on_partial_go_moves_those_that_are_armed() -> None:
+    bench = Bench(on_partial="go")
+    bench.enable()
+    bench.deaf = lambda packet: packet.id == 2
+    results = bench.move({"a": 10, "b": 10}, confirm=True)
+    assert results["a"] is Outcome.ACKED
+    assert isinstance(results["b"], ReplyTimeout)
+    assert bench.register(1, "goal_position") == 2162
+
+
+def test_nobody_acknowledges() -> None:
+    bench = Bench(on_partial="go")
+    bench.enable()
+    bench.deaf = lambda packet: True
+    results = bench.move({"a": 10, "b": 10}, confirm=True)
+    assert all(isinstance(result, ReplyTimeout) for result in results.values())
+    assert "ACTION" not in bench.instructions()
+
+
+def test_a_servo_that_cannot_be_disarmed_stays_suspect() -> None:
+    bench = Bench()
+    bench.enable()
+    bench.deaf = lambda packet: packet.id == 2 or (packet.code == Instruction.REG_WRITE and packet.params[0] != 42)
+    bench.move({"a": 10, "b": 10}, confirm=True)
+    assert bench.register(1, "async_write_flag") == 1
+    bench.deaf = lambda packet: False
+    results = bench.move({"b": 1, "a": Goal("position", 1, acceleration=900)}, confirm=True)
+    assert results == {"b": Outcome.ACKED, "a": Outcome.ACKED}, "overwritten"
+
+
+# Servos that answer no write
+
+
+def test_without_acknowledgements_nothing_is_waited_for() -> None:
+    bench = Bench(status_return="read_only")
+    bench.enable()
+    assert bench.move({"a": 10}) == {"a": Outcome.SENT}
+    assert bench.instructions() == ["WRITE"]
+
+
+def test_without_acknowledgements_the_flag_confirms() -> None:
+    bench = Bench(status_return="read_only")
+    bench.enable()
+    assert bench.move({"a": 10, "b": 10}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+    assert bench.instructions() == ["REG_WRITE", "READ", "REG_WRITE", "READ", "ACTION"]
+    assert bench.move({"a": 3}, confirm=True) == {"a": Outcome.ACKED}
+    bench.deaf = lambda packet: packet.id == 2 and packet.code == Instruction.REG_WRITE
+    results = bench.move({"a": 5, "b": 5}, confirm=True)
+    assert "its flag reads 0" in str(results["b"])
+    assert isinstance(results["a"], ActionWithheld)
+
+
+# What a goal says
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (Goal("position", 0), (2048, 0, 1000)),
+        (Goal("position", 0, speed=90), (2048, 0, 1024)),
+        (Goal("position", 0, speed=0.001), (2048, 0, 1)),
+        (Goal("position", 45, duration=0.5), (2560, 0, 1024)),
+        (Goal("position", 0, duration=0.5), (2048, 0, 1000)),
+    ],
+)
+def test_position_time_and_speed(goal: Goal, words: tuple[int, int, int]) -> None:
+    bench = Bench()
+    bench.enable()
+    bench.move({"a": goal})
+    data = bench.said[0].params[1:]
+    assert tuple(int.from_bytes(data[at : at + 2], "little") for at in (0, 2, 4)) == words
+
+
+def test_an_scs_has_a_time_of_its_own() -> None:
+    bench = Bench({"s": {"id": 1, "model": "scs"}})
+    bench.enable()
+    bench.move({"s": Goal("position", 10, duration=1.5)})
+    assert bench.said[0].params.hex(" ") == "2a 02 2f 05 dc 00 00"
+    bench.said.clear()
+    bench.move({"s": Goal("position", 10, speed=45)})
+    assert bench.said[0].params.hex(" ") == "2a 02 2f 00 01 00 d1", "the time word is 1 while speed rules: so a restart shows"
+
+
+@pytest.mark.parametrize(
+    ("speed", "raw"), [({"speed": 45}, 512), ({"max_speed": 90}, 1024), ({"speed": 45, "max_speed": 90}, 512), ({}, 1000)]
+)
+def test_whose_speed_rules(speed: dict[str, float], raw: int) -> None:
+    bench = Bench({"a": {"id": 1, "model": "sts", **speed}})
+    bench.enable()
+    bench.move({"a": 10})
+    assert int.from_bytes(bench.said[0].params[5:7], "little") == raw
+
+
+def test_speed_0_needs_leave() -> None:
+    bench = Bench()
+    with pytest.raises(LimitError, match="allow_max_speed"):
+        bench.driver.check_goal(ServoGoal("a", Goal("position", 0, speed=0)))
+    free = Bench({"a": {"id": 1, "model": "sts", "allow_max_speed": True}})
+    free.enable()
+    free.move({"a": Goal("position", 0, speed=0)})
+    assert free.said[0].params[5:7] == b"\0\0"
+
+
+def test_effort_and_acceleration_stand_beside_the_goal() -> None:
+    bench = Bench({"a": {"id": 1, "model": "sts", "acceleration": 500, "torque_limit": 50}})
+    bench.enable()
+    assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (57, 500)
+    bench.move({"a": Goal("position", 1, effort=20, acceleration=1000)})
+    assert bench.said[0].params[0] == 41
+    assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (114, 200)
+    bench.move({"a": 2})
+    assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (57, 500), "the config's again"
+
+
+@pytest.mark.parametrize(("position", "right"), [(2699.9, True), (2700.1, False), (-3059.9, True), (-3060.1, False)])
+def test_the_wires_own_limits(position: float, right: bool) -> None:
+    bench = Bench()
+    goal = ServoGoal("a", Goal("position", position))
+    if right:
+        bench.driver.check_goal(goal)
+    else:
+        with pytest.raises(LimitError, match="goal_position"):
+            bench.driver.check_goal(goal)
+
+
+def test_an_scs_cannot_accelerate() -> None:
+    bench = Bench({"s": {"id": 1, "model": "scs"}})
+    with pytest.raises(NotSupported, match="no register for an acceleration"):
+        bench.driver.check_goal(ServoGoal("s", Goal("position", 1, acceleration=5)))
+
+
+def test_a_duration_needs_a_start() -> None:
+    bench = Bench()
+    with pytest.raises(LimitError, match="read the servo first"):
+        bench.driver.plan([ServoGoal("a", Goal("position", 1, duration=1))], together=False, confirm=False)
