@@ -128,5 +128,5 @@ class PartialFailure(ServobusError):
     def __init__(self, results: Mapping[str, Any], **where: Any) -> None:
         self.results = dict(results)
         failed = {name: result for name, result in self.results.items() if isinstance(result, Exception)}
-        listing = "; ".join(f"{name}: {error}" for name, error in failed.items())
+        listing = "; ".join(f"{name}: {getattr(error, 'message', error)}" for name, error in failed.items())
         super().__init__(f"{len(failed)} of {len(self.results)} failed: {listing}", **where)

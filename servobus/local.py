@@ -48,10 +48,12 @@ class LocalRig(Rig):
         self.config = config
         self.buses: dict[str, BusService] = {}
         self.links: dict[str, Link] = {}
+        self.left: dict[str, StopReport] = {}
+        """What became of each servo that was still enabled at the end, by full name; filled when the context has ended."""
         self._names = {name: place for name, place in config.names.items() if not only or place[0] in only}
         self._tried: dict[str, asyncio.Event] = {}
         self._down: dict[str, LinkDown] = {}
-        self._parking: set[asyncio.Task[None]] = set()
+        self._parking: set[asyncio.Task[StopReport]] = set()
         for name in only or config.buses:
             self._add(name, config.buses[name])
             if trace is not None:
@@ -110,15 +112,23 @@ class LocalRig(Rig):
             raise error.at(bus=name)
 
     async def leave(self) -> None:
-        """Exit policies, on all buses at once: park first where a servo says so."""
-        parked = [self._park(bus, servo) for bus, servo in self._enabled("on_exit", "park")]
-        await asyncio.gather(*parked, *self._parking)
+        """Exit policies, on all buses at once: park first where a servo says so. `left` tells what became of each servo."""
+        for kind in ("hold", "limp", "park"):
+            for bus, servo in self._enabled("on_exit", kind):
+                self.left[f"{bus.name}/{servo}"] = StopReport(kind, False, False, "no answer in time")
+        parking = self._enabled("on_exit", "park")
+        reports = await asyncio.gather(*(self._park(bus, servo) for bus, servo in parking))
+        self.left.update({f"{bus.name}/{servo}": report for (bus, servo), report in zip(parking, reports, strict=True)})
+        await asyncio.gather(*self._parking)
+        await asyncio.gather(*(self._leave(bus) for bus in self.buses.values()))
+        for name, report in self.left.items():
+            if not report.confirmed and report.action != "park":  # that has its own event
+                self._event("exit_unconfirmed", servo=name, action=report.action, detail=report.detail)
+
+    async def _leave(self, bus: BusService) -> None:
         with anyio.move_on_after(EXIT_TIMEOUT):
-            reports = await asyncio.gather(*(bus.motion.leave() for bus in self.buses.values()))
-            for bus, report in zip(self.buses, reports, strict=True):
-                for servo, entry in report.items():
-                    if not entry.confirmed:
-                        self._event("exit_unconfirmed", bus=bus, servo=servo, action=entry.action, detail=entry.detail)
+            for servo, report in (await bus.motion.leave()).items():
+                self.left[f"{bus.name}/{servo}"] = report
 
     async def close(self) -> None:
         """Every line, once nobody opens them again."""
@@ -180,11 +190,12 @@ class LocalRig(Rig):
         bus, servo = self.bus_of(name)
         return await bus.motion.settle(servo, tolerance=tolerance, timeout=timeout)
 
-    async def _park(self, bus: BusService, servo: str) -> None:
+    async def _park(self, bus: BusService, servo: str) -> StopReport:
         """To the park pose, then limp; limp also when it does not get there in time."""
         report = await bus.motion.park(servo)
         if not report.confirmed:
             self._event("park_unconfirmed", bus=bus.name, servo=servo, detail=report.detail)
+        return report
 
     def _enabled(self, policy: str, kind: str) -> list[tuple[BusService, str]]:
         return [

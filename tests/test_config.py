@@ -28,7 +28,8 @@ def test_a_good_config() -> None:
     config = parse_config(GOOD, "rig.yaml")
     arm = config.buses["arm"]
     assert isinstance(arm, SmsBus)
-    assert (arm.baudrate, arm.poll.feedback, arm.poll.health) == (1_000_000, 50, None)
+    assert arm.baudrate == 1_000_000
+    assert arm.poll.rates() == {"feedback": 50}
     assert arm.servos["shoulder"].limits == (-90, 90)
     assert config.models["arm"]["sts"].name == "sts"
     assert config.names == {"arm/shoulder": ("arm", "shoulder"), "arm/elbow": ("arm", "elbow")}
@@ -37,7 +38,7 @@ def test_a_good_config() -> None:
 def test_a_config_cannot_be_changed() -> None:
     config = parse_config(GOOD, "rig.yaml")
     with pytest.raises(ValueError, match="frozen"):
-        config.buses["arm"].baudrate = 9600
+        setattr(config.buses["arm"], "baudrate", 9600)  # noqa: B010 - the type checker would refuse it too
     with pytest.raises(AttributeError):
         config.version = 2  # type: ignore[misc]
 

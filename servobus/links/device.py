@@ -61,7 +61,7 @@ def find_holder(path: str) -> tuple[int, str] | None:
 
 
 def _locked_by(wanted: os.stat_result) -> set[int]:
-    """Processes with a lock on this file: `1: FLOCK ADVISORY WRITE 4711 00:1c:3 0 EOF`, the third to last its device and inode."""
+    """Processes with a lock on this file: `1: FLOCK ADVISORY WRITE 4711 00:1c:3 0 EOF` names device and inode."""
     place = f"{os.major(wanted.st_dev):02x}:{os.minor(wanted.st_dev):02x}:{wanted.st_ino}"
     try:
         lines = [line.split() for line in Path("/proc/locks").read_text().splitlines()]

@@ -92,7 +92,7 @@ class Register(Data):
             raise LimitError(f"register {self.name}: {value!r} is none of {known}")
         if not is_number(value):
             raise LimitError(f"register {self.name}: {value!r} is not a finite number")
-        return round(value / self.scale)
+        return round(float(value) / self.scale)
 
 
 class ServoModel(Data):

@@ -14,9 +14,9 @@ import sys
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar, cast
 
 import click
 import structlog
@@ -25,7 +25,8 @@ from rich.table import Table
 
 from servobus.config import Config, load_config
 from servobus.doors.cli.tracing import Tracer
-from servobus.errors import ConfigError
+from servobus.doors.cli.voice import Voice
+from servobus.errors import ConfigError, DeviceError
 from servobus.local import LocalRig, Trace, open_rig
 from servobus.protocols.base import State
 from servobus.protocols.table import PROTOCOLS
@@ -98,6 +99,9 @@ async def opened(options: Options, names: Collection[str] = (), *, degraded: boo
     buses = dict.fromkeys(config.names[name][0] for name in full)
     async with traced(config, options) as trace, open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
         yield rig
+    doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]
+    if doubtful:
+        raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; look before you touch")
 
 
 @asynccontextmanager
@@ -110,7 +114,8 @@ async def traced(config: Config, options: Options) -> AsyncIterator[Trace | None
         yield None
         return
     codecs = {name: PROTOCOLS[bus.protocol].codec() for name, bus in config.buses.items()}
-    tracer = Tracer(codecs, partial(click.echo, err=options.trace or options.as_json), heard=options.trace)
+    voice = Voice(sys.stderr if options.trace or options.as_json else sys.stdout)
+    tracer = Tracer(codecs, voice.say, heard=options.trace)
     try:
         yield tracer
     finally:
@@ -169,7 +174,7 @@ def logs(level: int = logging.WARNING) -> None:
             else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        logger_factory=structlog.WriteLoggerFactory(cast("TextIO", Voice(sys.stderr))),
         cache_logger_on_first_use=False,
     )
 

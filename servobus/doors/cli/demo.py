@@ -116,6 +116,7 @@ async def _caller(servo: Servo, tally: Tally, started: float, seconds: float) ->
         pending.add(task)
         task.add_done_callback(pending.discard)
     await asyncio.gather(*pending)
+    await asyncio.sleep(started + seconds - loop.time())
 
 
 async def _send(servo: Servo, position: float, tally: Tally) -> None:
@@ -138,7 +139,7 @@ def _row(rig: LocalRig, name: str, tally: Tally, before: dict[str, Any], seconds
         "goals accepted": goals,
         "goal frames": frames,
         "goals/frame": round(delivered / frames, 2) if frames else 0.0,
-        "goals/s": round(goals / seconds, 1),
+        "goals/s": round(delivered / seconds, 1),
         "feedback Hz": round(feedback / servos / seconds, 1),
         "wire load %": stats["wire_load_percent"],
         "turn p50 ms": stats["turn_ms"]["p50"],

@@ -278,7 +278,7 @@ class SmsDriver:
 
 
 def fence_size(avoid: Sequence[Hashable]) -> int:
-    """A READ length that no reply still under way can have; when all are taken, the one asked longest ago (`avoid` is oldest first)."""
+    """A READ length that no reply still under way can have; when all are taken, the one asked longest ago, so `avoid` is by age."""
     free = (size for size in FENCE_SIZES if size not in avoid)
     oldest = (key for key in avoid if isinstance(key, int) and key in FENCE_SIZES)
     return next(free, None) or next(oldest)

@@ -63,8 +63,8 @@ def _notes(
     wanted = servo.options.limits
     if wanted and limits and servo.mode == "position" and (limits[0] > wanted[0] or limits[1] < wanted[1]):
         yield (
-            f"its own stored limits {limits[0]:.1f} to {limits[1]:.1f} are tighter than the config's {wanted[0]:g} to {wanted[1]:g}: "
-            "goals between them end at the stored limit"
+            f"its own stored limits {limits[0]:.1f} to {limits[1]:.1f} are tighter than the config's {wanted[0]:g} to "
+            f"{wanted[1]:g}: goals between them end at the stored limit"
         )
 
 

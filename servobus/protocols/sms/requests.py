@@ -46,7 +46,7 @@ class Ping(SmsRequest[int | None]):
         super().__init__(node, Instruction.PING)
 
     def answers(self, reply: Packet) -> bool:
-        return not reply.params and (reply.id == self.node or self.node == BROADCAST_ID)
+        return not reply.params and self.node in (reply.id, BROADCAST_ID)
 
     def parse(self, replies: Sequence[Packet]) -> int | None:
         return replies[0].code

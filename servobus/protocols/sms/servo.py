@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 from servobus.errors import LimitError, NotSupported
@@ -61,7 +62,7 @@ class FittedServo:
         if register.unit == "speed":
             return round(self.calibration.rate_to_raw(value) / register.scale)
         if register.unit == "acceleration":
-            return round(value / self.calibration.unit_per_step / register.scale)
+            return round(float(value) / self.calibration.unit_per_step / register.scale)
         return register.to_raw(value)
 
     def _decoder(self, first: str, last: str) -> Callable[[bytes], Update]:
@@ -169,7 +170,7 @@ class FittedServo:
 
     def _join(self, parts: list[tuple[Register, bytes]]) -> tuple[int, bytes]:
         parts.sort(key=lambda part: part[0].address)
-        for (register, _), (following, _) in zip(parts, parts[1:], strict=False):
+        for (register, _), (following, _) in pairwise(parts):
             if register.end != following.address:
                 raise NotSupported(
                     f"{register.name} and {following.name} of model {self.model.name} cannot be written in one frame",
@@ -178,6 +179,6 @@ class FittedServo:
         return parts[0][0].address, b"".join(data for _, data in parts)
 
     def _wrong_mode(self, kind: GoalKind) -> str:
-        if kind == "velocity" and self.model.wheel is None:
-            return f"model {self.model.name} does positions only"
+        if kind not in self.model.kinds:
+            return f"model {self.model.name} takes {', '.join(self.model.kinds)} goals only"
         return f"the servo is in {self.mode} mode and cannot take a {kind} goal: change its mode registers while it is disabled"

@@ -51,7 +51,7 @@ def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
     raise AssertionError(f"{event} was never logged")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGHUP, 0), (signal.SIGINT, 130)])
 def test_run_ends_in_order(rig: str, number: signal.Signals, status: int) -> None:
     with servobus("run", rig, "--log-every", "0.2") as process:
         assert until(process, "running")["buses"] == ["arm"]
@@ -122,3 +122,47 @@ def test_who_reads_no_further_is_told_nothing() -> None:
         assert process.stderr is not None
         assert process.stderr.read() == ""
         assert process.wait(10) == 1
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 143), (signal.SIGINT, 130)])
+def test_an_interrupted_move_leaves_the_servo_as_its_on_exit_says(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("move", "-c", rig, "shoulder=80", "--speed", "1", "--timeout", "100", "--trace") as process:
+        assert process.stderr is not None
+        torque_on = "WRITE 0x28 = 01"
+        assert any(torque_on in line for line in process.stderr)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+        assert process.returncode == status
+        assert "SYNC_WRITE 0x28 id 1 = 00" in err
+        assert out == ""
+
+
+def test_a_trace_that_nobody_reads_does_not_stop_a_motion(rig: str) -> None:
+    with servobus("move", "-c", rig, "shoulder=5", "--speed", "300", "--trace") as process:
+        assert process.stderr is not None
+        process.stderr.readline()
+        process.stderr.close()
+        assert process.stdout is not None
+        assert "arm/shoulder" in process.stdout.read()
+        assert process.wait(10) == 0
+
+
+def test_logs_that_nobody_reads_do_not_stop_a_daemon(rig: str) -> None:
+    with servobus("run", rig, "--log-every", "0.1") as process:
+        until(process, "state")
+        assert process.stderr is not None
+        process.stderr.close()
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.5)
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_a_picture_that_nobody_reads_ends_the_monitor(rig: str) -> None:
+    with servobus("monitor", "-c", rig, "--hz", "50") as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.wait(10) == 1
+        assert process.stderr is not None
+        assert process.stderr.read() == ""

@@ -11,6 +11,7 @@ from servobus.protocols.sms.codec import Instruction, Packet
 from servobus.protocols.sms.device import SmsDevice, devices
 from servobus.protocols.sms.driver import SmsDriver
 from servobus.protocols.sms.load import packaged_models
+from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
 from tests.protocols.sms.simulated import packet_of
 
@@ -22,10 +23,10 @@ TWO = {"a": {"id": 1, "model": "sts"}, "b": {"id": 2, "model": "sts"}}
 class Bench:
     """`said` are the frames in order; `deaf` may name requests that get lost on the way."""
 
-    def __init__(self, servos: Mapping[str, Mapping[str, Any]] = TWO, **keys: Any) -> None:
+    def __init__(self, servos: Mapping[str, Mapping[str, Any]] = TWO, *, sts: SmsModel | None = None, **keys: Any) -> None:
         data = {"protocol": "sms", "port": "sim:", "baudrate": 1_000_000, "servos": servos, **keys}
         self.options = SmsBus.model_validate(data)
-        models = packaged_models()
+        models = {**packaged_models(), "sts": sts or packaged_models()["sts"]}
         self.driver = SmsDriver(self.options, models)
         self.devices: dict[int, SmsDevice] = {device.node: device for device in devices(self.options, models)}
         self.said: list[Packet] = []
@@ -71,3 +72,13 @@ class Bench:
 
     def register(self, node: int, name: str) -> int:
         return self.devices[node].get(name)
+
+
+def meddle(device: SmsDevice, torque: int) -> Callable[[Packet], bool]:
+    """Somebody else writes the torque after every frame; no answer gets lost."""
+
+    def mute(packet: Packet) -> bool:
+        device.memory.put(device.memory.registers["torque_enable"], torque)
+        return False
+
+    return mute

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -27,19 +28,19 @@ def heard(*chunks: bytes) -> list[Packet]:
 
 
 @pytest.mark.parametrize(("request_", "text"), REQUESTS.values(), ids=REQUESTS)
-def test_requests_are_the_frames_of_the_document(request_: Request[object], text: str) -> None:
+def test_requests_are_the_frames_of_the_document(request_: Request[Any], text: str) -> None:
     assert request_.frame == bytes.fromhex(text)
 
 
 @pytest.mark.parametrize(("request_", "text"), REQUESTS.values(), ids=REQUESTS)
-def test_they_are_understood(request_: Request[object], text: str) -> None:
+def test_they_are_understood(request_: Request[Any], text: str) -> None:
     (packet,) = heard(bytes.fromhex(text))
     assert packet.id == request_.node
     assert encode(packet.id, packet.code, packet.params) == packet.frame == request_.frame
 
 
 @pytest.mark.parametrize(("request_", "text", "value"), REPLIES.values(), ids=REPLIES)
-def test_replies_of_the_document_answer(request_: Request[object], text: str, value: object) -> None:
+def test_replies_of_the_document_answer(request_: Request[Any], text: str, value: object) -> None:
     (packet,) = heard(bytes.fromhex(text))
     assert request_.answers(packet)
     assert request_.parse([packet]) == value

@@ -11,7 +11,7 @@ from servobus.protocols.base import Goal, ServoGoal
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.driver import FENCE_SIZES, fence_size
 from servobus.protocols.sms.requests import Read, SyncRead
-from tests.protocols.sms.bench import TWO, Bench
+from tests.protocols.sms.bench import TWO, Bench, meddle
 
 LOCK, DELAY = 55, 7
 
@@ -53,8 +53,7 @@ def test_enable_that_does_not_read_back_fails() -> None:
     bench = Bench()
     bench.deaf = lambda packet: False
     device = bench.devices[1]
-    torque = device.memory.registers["torque_enable"]
-    bench.mute = lambda packet: bool(device.memory.put(torque, 0))
+    bench.mute = meddle(device, 0)
     with pytest.raises(DeviceError, match="it stays disabled"):
         bench.run(bench.driver.enable("a"))
 
@@ -66,7 +65,7 @@ def test_disable_reads_back() -> None:
     assert (report.action, report.written, report.confirmed) == ("limp", True, True)
     assert bench.register(1, "torque_enable") == 0
     device = bench.devices[1]
-    bench.mute = lambda packet: bool(device.memory.put(device.memory.registers["torque_enable"], 1))
+    bench.mute = meddle(device, 1)
     report = bench.run(bench.driver.disable("a"))
     assert (report.confirmed, report.detail) == (False, "torque still reads on")
 

@@ -8,7 +8,9 @@ from servobus.errors import ActionWithheld, LimitError, NotSupported, ReplyTimeo
 from servobus.protocols.base import Goal, Outcome, ServoGoal
 from servobus.protocols.sms.codec import Instruction, Packet
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
+from servobus.protocols.sms.model import SmsModel
 from tests.protocols.sms.bench import TWO, Bench
+from tests.protocols.sms.simulated import changed, model_of
 
 MANY = {f"s{number}": {"id": number, "model": "sts"} for number in range(1, 41)}
 FLAG = 64
@@ -66,7 +68,7 @@ def test_sync_write_is_split_at_its_greatest_size(count: int, frames: int) -> No
     """128 bytes hold 8 + 17 x 7."""
     bench = Bench(dict(list(MANY.items())[:count]))
     bench.enable()
-    results = bench.move({name: 1.0 for name in bench.driver.nodes})
+    results = bench.move(dict.fromkeys(bench.driver.nodes, 1.0))
     assert set(results.values()) == {Outcome.SENT} or frames > 1
     assert len(results) == count
     assert len(bench.said) == frames
@@ -281,3 +283,27 @@ def test_a_duration_needs_a_start() -> None:
     bench = Bench()
     with pytest.raises(LimitError, match="read the servo first"):
         bench.driver.plan([ServoGoal("a", Goal("position", 1, duration=1))], together=False, confirm=False)
+
+
+def test_a_model_without_a_flag_cannot_confirm_without_acknowledgements() -> None:
+    bench = Bench(sts=changed("sts", async_write_flag=None), status_return="read_only")
+    bench.enable()
+    with pytest.raises(NotSupported, match="its REG WRITE flag cannot be read"):
+        bench.move({"a": 1, "b": 1}, confirm=True)
+    assert bench.said == []
+
+
+def test_a_model_without_a_wheel_takes_positions_only() -> None:
+    data = model_of("sts").model_dump()
+    bench = Bench(sts=SmsModel.model_validate({**data, "wheel": None}))
+    with pytest.raises(NotSupported, match="takes position goals only"):
+        bench.driver.check_goal(ServoGoal("a", Goal("velocity", 1)))
+
+
+def test_a_wheels_acceleration_stands_too_far_from_its_speed() -> None:
+    bench = Bench()
+    device = bench.devices[1]
+    device.memory.store(device.memory.registers["mode"], 1)
+    bench.run(bench.driver.identify("a"))
+    with pytest.raises(NotSupported, match="acceleration and goal_speed of model sts cannot be written in one frame"):
+        bench.driver.check_goal(ServoGoal("a", Goal("velocity", 1, acceleration=100)))

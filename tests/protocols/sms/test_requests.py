@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from servobus.protocols.base import Request
@@ -48,7 +50,7 @@ def reply(servo: int, params: bytes = b"", status: int = 0) -> Packet:
     ],
     ids=repr,
 )
-def test_how_many_answer(request_: Request[object], replies: int, nodes: tuple[int, ...]) -> None:
+def test_how_many_answer(request_: Request[Any], replies: int, nodes: tuple[int, ...]) -> None:
     assert (request_.replies, request_.nodes) == (replies, nodes)
 
 
@@ -65,7 +67,7 @@ def test_how_many_answer(request_: Request[object], replies: int, nodes: tuple[i
     ],
     ids=repr,
 )
-def test_what_may_be_said_again(request_: Request[object], repeatable: bool) -> None:
+def test_what_may_be_said_again(request_: Request[Any], repeatable: bool) -> None:
     assert request_.idempotent is repeatable
 
 
@@ -74,7 +76,7 @@ def test_what_may_be_said_again(request_: Request[object], repeatable: bool) -> 
     [Ping(1), PingById(1), Read(1, 56, 2, bytes), Write(1, 42, b"\0\0"), RegWrite(1, 42, b"\0\0"), Action(1)],
     ids=repr,
 )
-def test_another_servo_or_another_length_is_no_answer(request_: Request[object]) -> None:
+def test_another_servo_or_another_length_is_no_answer(request_: Request[Any]) -> None:
     size = request_.reply_size - 6
     assert request_.answers(reply(1, bytes(size), status=0x20))
     assert not request_.answers(reply(2, bytes(size)))

@@ -8,7 +8,7 @@ import pytest
 
 from servobus.protocols.base import Goal, StopReport, StopTarget
 from servobus.protocols.sms.codec import Instruction
-from tests.protocols.sms.bench import TWO, Bench
+from tests.protocols.sms.bench import TWO, Bench, meddle
 
 
 def target(
@@ -106,7 +106,7 @@ def test_torque_that_stays_on_is_told() -> None:
     bench = Bench()
     bench.enable()
     device = bench.devices[1]
-    bench.mute = lambda packet: bool(device.memory.put(device.memory.registers["torque_enable"], 1))
+    bench.mute = meddle(device, 1)
     assert stop(bench, target("a", "limp"))["a"] == StopReport("limp", True, False, "torque still reads on")
 
 
