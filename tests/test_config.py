@@ -30,7 +30,7 @@ def test_a_good_config() -> None:
     assert isinstance(arm, SmsBus)
     assert arm.baudrate == 1_000_000
     assert arm.poll.rates() == {"feedback": 50}
-    assert arm.servos["shoulder"].limits == (-90, 90)
+    assert list(arm.servos["shoulder"].limits or ()) == [-90, 90]
     assert config.models["arm"]["sts"].name == "sts"
     assert config.names == {"arm/shoulder": ("arm", "shoulder"), "arm/elbow": ("arm", "elbow")}
 
