@@ -113,9 +113,9 @@ class LocalRig(Rig):
 
     async def leave(self) -> None:
         """Exit policies, on all buses at once: park first where a servo says so. `left` tells what became of each servo."""
-        for kind in ("hold", "limp", "park"):
-            for bus, servo in self._enabled("on_exit", kind):
-                self.left[f"{bus.name}/{servo}"] = StopReport(kind, False, False, "no answer in time")
+        for bus in self.buses.values():
+            for record in bus.motion.to_leave():
+                self.left[f"{bus.name}/{record.name}"] = StopReport(record.options.on_exit, False, False, "no answer in time")
         parking = self._enabled("on_exit", "park")
         reports = await asyncio.gather(*(self._park(bus, servo) for bus, servo in parking))
         self.left.update({f"{bus.name}/{servo}": report for (bus, servo), report in zip(parking, reports, strict=True)})

@@ -308,6 +308,33 @@ async def test_the_end_leaves_each_servo_as_its_policy_says(policy: str, on: boo
 
 
 @virtual
+async def test_the_end_reaches_a_servo_whose_enable_nobody_waited_for() -> None:
+    loop, torque_on = asyncio.get_running_loop(), asyncio.Event()
+
+    def trace(bus: str, sent: bool, data: bytes, time: float) -> None:
+        if sent and data[4:] == bytes((Instruction.WRITE, 0x28, 1)) + data[-1:]:
+            torque_on.set()
+
+    async with open_rig(config("s1: {id: 1, model: sts, on_exit: limp}", "s2: {id: 2, model: sts}"), trace=trace) as rig:
+        device = devices(rig)[1]
+        enabling = loop.create_task(rig.enable("s1"))
+        await torque_on.wait()
+        enabling.cancel()
+    assert not energised(device)
+    assert {name: (report.action, report.confirmed) for name, report in rig.left.items()} == {"arm/s1": ("limp", True)}
+
+
+@virtual
+async def test_what_was_disabled_or_parked_is_not_left_a_second_time() -> None:
+    async with open_rig(config("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts, on_exit: park, park_pose: 3}")) as rig:
+        await rig.enable()
+        await rig.disable("s1")
+        device = devices(rig)[2]
+    assert not energised(device)
+    assert {name: (report.action, report.confirmed) for name, report in rig.left.items()} == {"arm/s2": ("park", True)}
+
+
+@virtual
 async def test_the_end_parks() -> None:
     async with open_rig(config("s1: {id: 1, model: sts, on_exit: park, park_pose: 30}")) as rig:
         await rig.enable()

@@ -106,6 +106,7 @@ class Motion:
         if record.identity is None:
             await self._bus.identify(servo)
         self._set_enabled(record, False)
+        record.touched = True  # also when this is cancelled or fails half-way
         present = await self._bus.perform(self._bus.driver.enable(servo), record.node.id, servo=servo, motion=True)
         if self.latched:
             raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
@@ -119,6 +120,7 @@ class Motion:
         report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
         if not report.confirmed:
             raise DeviceError(f"torque off was written and not confirmed: {report.detail}", bus=self._bus.name, servo=servo)
+        record.touched = False
 
     async def stop(self) -> dict[str, StopReport]:
         """E-stop for this bus: everything that moves is dropped, every servo stops as its `on_estop` says (park: holds first)."""
@@ -155,6 +157,7 @@ class Motion:
             record.setpoint = None
             if target.kind == "limp":
                 self._set_enabled(record, False)
+                record.touched = record.touched and not reports[record.name].confirmed
         return reports
 
     async def settle(self, servo: str, *, tolerance: float | None, timeout: float) -> State:
@@ -187,6 +190,7 @@ class Motion:
         except ServobusError as error:
             detail = f"not at its park pose: {error.message}"
         report = (await self.limp([servo]))[servo]
+        self._bus.records[servo].touched = False  # its report tells; a hold on the way out would only stiffen what should be limp
         return replace(report, action="park", confirmed=report.confirmed and not detail, detail=detail or report.detail)
 
     def refuse(self) -> None:
@@ -205,10 +209,12 @@ class Motion:
         return restarted
 
     async def leave(self) -> dict[str, StopReport]:
-        """What each enabled servo's `on_exit` says, hold and limp; park is the rig's."""
-        return await self._stop(
-            lambda record: record.options.on_exit, [record for record in self._bus.records.values() if record.enabled]
-        )
+        """What `on_exit` says, hold and limp, for each servo whose torque may be on because of us; park is the rig's."""
+        return await self._stop(lambda record: record.options.on_exit, self.to_leave())
+
+    def to_leave(self) -> list[ServoRecord]:
+        """The servos whose torque may be on because of us."""
+        return [record for record in self._bus.records.values() if record.touched]
 
     def _set_enabled(self, record: ServoRecord, enabled: bool) -> None:
         record.enabled = enabled

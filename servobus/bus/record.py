@@ -22,6 +22,7 @@ class ServoRecord:
         "options",
         "position_at",
         "setpoint",
+        "touched",
         "updated_at",
     )
 
@@ -30,6 +31,8 @@ class ServoRecord:
         self.options = options
         self.node = node
         self.enabled = False
+        self.touched = False
+        """We may have switched its torque on, even if enable() did not come through: at the end it is left as `on_exit` says."""
         self.identity: Identity | None = None
         self.introduce_after = 0.0
         """Not before this is an unknown servo asked again who it is."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from collections.abc import Callable
+
+import structlog
 
 from tests.campaigns import faults, line, turns
 
@@ -55,6 +58,7 @@ def main() -> int:
     known = CAMPAIGNS[arguments.kind]
     if unknown := set(arguments.campaigns) - set(known):
         parser.error(f"no {arguments.kind} campaign {', '.join(sorted(unknown))}: there are {', '.join(known)}")
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
     kept = [known[name](arguments.count) for name in arguments.campaigns or known]
     return 0 if all(kept) else 1
 

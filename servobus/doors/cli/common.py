@@ -190,13 +190,14 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
-    """Numbers right, words left."""
-    made = Table(title=title, box=None, pad_edge=False, header_style="bold")
-    kept = [[show(cell) for cell in row] for row in rows]
-    for index, column in enumerate(columns):
+def table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> Table:
+    """Numbers right, words left. `narrow`: close together, and only the last column may be folded."""
+    made = Table(title=title, box=None, pad_edge=False, header_style="bold", collapse_padding=narrow)
+    kept, heads = [[show(cell) for cell in row] for row in rows], list(columns)
+    for index, column in enumerate(heads):
         number = bool(kept) and all(_is_number(row[index]) for row in kept)
-        made.add_column(column, justify="right" if number else "left", overflow="fold")
+        whole = narrow and index < len(heads) - 1
+        made.add_column(column, justify="right" if number else "left", overflow="fold", no_wrap=whole)
     for row in kept:
         made.add_row(*row)
     return made
@@ -217,14 +218,15 @@ def _is_number(text: str) -> bool:
     return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
 
 
-def echo_table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+def echo_table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> None:
     console = Console()
     if not console.is_terminal:
         console.width = 200  # nobody wraps a file
-    console.print(table(title, columns, rows), highlight=False)
+    console.print(table(title, columns, rows, narrow=narrow), highlight=False)
 
 
-STATE_COLUMNS = ("servo", "position", "goal", "speed", "load %", "V", "°C", "A", "moving", "enabled", "health", "faults")
+STATE_COLUMNS = ("servo", "position", "goal", "speed", "load%", "V", "°C", "A", "state", "health", "faults")
+"""Narrow enough for a terminal of 80 columns."""
 
 
 def state_row(name: str, state: State) -> tuple[object, ...]:
@@ -233,13 +235,16 @@ def state_row(name: str, state: State) -> tuple[object, ...]:
         name,
         state.position,
         state.goal,
-        state.speed,
-        state.load,
-        state.voltage,
+        _tenths(state.speed),
+        _tenths(state.load),
+        _tenths(state.voltage),
         state.temperature,
         state.current,
-        state.moving,
-        state.enabled,
+        "moving" if state.moving else "enabled" if state.enabled else None,
         state.health,
         state.faults or None,
     )
+
+
+def _tenths(value: float | None) -> str | None:
+    return None if value is None else f"{value:.1f}"

@@ -94,7 +94,7 @@ async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) 
         return 1 if failed else 0
     rows = [state_row(name, state) for name, state in answers.items() if name not in failed]
     if rows:
-        echo_table(None, STATE_COLUMNS, rows)
+        echo_table(None, STATE_COLUMNS, rows, narrow=True)
     for error in failed.values():
         click.echo(f"servobus: {error}", err=True)
     return 1 if failed else 0

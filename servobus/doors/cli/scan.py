@@ -162,13 +162,13 @@ def _tell(options: Options, config: Config, name: str, found: list[Found], as_ya
     elif not found:
         click.echo("nobody answered: is the power on, are the baud rates right, is another program on the line?", err=True)
     elif as_yaml:
-        click.echo(_starter(config, name, found), nl=False)
+        click.echo(starter(config, name, found), nl=False)
     else:
         rows = [(hit.id, hit.baudrate, hit.model, hit.product, hit.firmware, hit.note or None) for hit in found]
         echo_table(None, ("id", "baud rate", "model", "product", "firmware", "note"), rows)
 
 
-def _starter(config: Config, name: str, found: list[Found]) -> str:
+def starter(config: Config, name: str, found: list[Found]) -> str:
     """A config of what was found, that `check` accepts. A line has one rate, and a servo needs a model: what stands against
     that is told in comments."""
     options = config.buses[name]

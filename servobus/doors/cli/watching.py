@@ -73,11 +73,11 @@ def _lines(snapshot: Snapshot) -> None:
     """What is known, in one line for each servo."""
     for name, state in snapshot.items():
         cells = zip(STATE_COLUMNS[1:], state_row(name, state)[1:], strict=True)
-        click.echo(f"{name}  " + "  ".join(f"{column.replace(' ', '')}={show(cell)}" for column, cell in cells))
+        click.echo(f"{name}  " + "  ".join(f"{column}={show(cell)}" for column, cell in cells))
 
 
 def _picture(snapshot: Snapshot) -> Any:
-    return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()])
+    return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()], narrow=True)
 
 
 async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, tell: Callable[[Snapshot], None]) -> None:

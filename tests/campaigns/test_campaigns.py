@@ -1,0 +1,53 @@
+"""The long campaigns, short and seeded: the same rules, fewer turns. Their figures are for `scripts/soak`, never asserted."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pytest
+
+from tests.campaigns import faults, line
+from tests.campaigns.faults import KINDS, Result
+
+
+def assert_right(result: Result) -> None:
+    assert (result.wrong, result.leaked, result.waiting) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_faults(seed: int) -> None:
+    result = faults.faults(20_000, seed=seed)
+    assert_right(result)
+    assert result.reads > 19_000
+    assert result.counts["timeouts"] > 100, "the line was as bad as it should be"
+
+
+@pytest.mark.parametrize("chop", ["bytes", "random"])
+def test_faults_in_pieces(chop: Literal["bytes", "random"]) -> None:
+    assert_right(faults.faults(3000, chop=chop))
+
+
+def test_a_very_bad_line_is_slow_and_right() -> None:
+    result = faults.faults(3000, share=0.2)
+    assert_right(result)
+    assert result.timeouts > 0
+
+
+def test_cancelled_callers() -> None:
+    result = faults.cancel(3000)
+    assert_right(result)
+    assert result.cancelled >= 3000
+    assert result.reads > 1000
+
+
+def test_every_kind_of_fault_is_in() -> None:
+    damage = faults.options(0.01).model_dump()
+    assert all(damage[kind] > 0 for kind in KINDS)
+    assert sum(damage[kind] for kind in KINDS) == pytest.approx(0.01)
+
+
+def test_a_dead_servo_and_a_pulled_plug() -> None:
+    figures = line.main(0.2)
+    assert figures.rate_with_dead > 0
+    assert figures.unplug_errors == line.SERVOS - 1
+    assert figures.replug > 0
