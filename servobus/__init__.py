@@ -22,7 +22,7 @@ from servobus.errors import (
     UnknownName,
 )
 from servobus.local import open_rig as open
-from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
+from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Rig, Servo, Snapshot
 
 __all__ = [

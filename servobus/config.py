@@ -15,7 +15,7 @@ from typing import Annotated, Any, Union
 from pydantic import Field, TypeAdapter
 
 from servobus import yamlfile
-from servobus.complaints import Complaints, show
+from servobus.complaints import Complaints, show, sound_part
 from servobus.errors import ConfigError, ServobusError
 from servobus.links import check_port
 from servobus.protocols.model import ServoModel
@@ -64,7 +64,10 @@ def config_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "servobus config",
         "type": "object",
-        "properties": {"version": {"const": VERSION}, "buses": {**schema, "minProperties": 1}},
+        "properties": {
+            "version": {"const": VERSION, "description": "Of this format."},
+            "buses": {**schema, "minProperties": 1, "description": "Lines by name; each has one owner."},
+        },
         "required": list(KEYS),
         "additionalProperties": False,
         "$defs": definitions,
@@ -78,14 +81,14 @@ def _config(document: yamlfile.Document, folder: Path) -> Config:
     for name, data in _bus_entries(document.data, complaints):
         options = _bus(name, data, complaints)
         if options is not None:
-            buses[name] = options
-            models[name] = _models(("buses", name), options, folder, complaints)
+            buses[str(name)] = options
+            models[str(name)] = _models(("buses", name), options, folder, complaints)
     _check_ports(buses, complaints)
     complaints.raise_any()
     return Config(VERSION, buses, models)
 
 
-def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str, Any]]:
+def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str | int, Any]]:
     if not isinstance(data, dict):
         complaints.add((), f"found {show(data)}; a config begins with `version: 1` and has `buses:`")
         return []
@@ -102,8 +105,12 @@ def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str, Any]]:
     return list(buses.items())
 
 
-def _bus(name: str, data: Any, complaints: Complaints) -> BusOptions | None:
+def _bus(name: str | int, data: Any, complaints: Complaints) -> BusOptions | None:
+    """The options of a bus; of a bus with mistakes, what else can be checked."""
     path: KeyPath = ("buses", name)
+    if not isinstance(name, str):
+        complaints.add(path, f"found {show(name)} as a name; put it in quotes", key=True)
+        return None
     try:
         _name.validate_python(name)
     except ValueError:
@@ -117,27 +124,43 @@ def _bus(name: str, data: Any, complaints: Complaints) -> BusOptions | None:
         where = (*path, "protocol") if "protocol" in data else path
         complaints.add(where, f"found protocol {show(protocol)}; there are {', '.join(PROTOCOLS)}")
         return None
-    options: BusOptions | None = complaints.validated(PROTOCOLS[protocol].options, data, path)
+    kind = PROTOCOLS[protocol].options
+    options: BusOptions | None = complaints.validated(kind, data, path) or sound_part(kind, data)
     return options
 
 
 def _models(path: KeyPath, options: BusOptions, folder: Path, complaints: Complaints) -> Mapping[str, ServoModel]:
     """The models of a bus, and what its servos want that those cannot do."""
-    found: dict[str, ServoModel] = {}
-    places: dict[Any, str] = {}
+    found, refused = _find_models(options, folder)
+    owners: dict[Any, str] = {}
+    told: dict[str, str] = {}
     for servo, entry in options.servos.items():
         here = (*path, "servos", servo)
-        other = places.setdefault(entry.key, servo)
-        if other != servo:
-            complaints.add((*here, "id"), f"found id {entry.id} again (it is {other}'s); each servo has its own")
-        try:
-            one = options.model_copy(update={"servos": {servo: entry}})
-            found.update(PROTOCOLS[options.protocol].models(one, folder))
-        except ConfigError as error:
-            complaints.add((*here, "model"), str(error))
+        owner = owners.setdefault(entry.key, servo)
+        if owner != servo:
+            complaints.add((*here, "id"), f"found id {entry.id} again (it is {owner}'s); each servo has its own")
+        if servo in refused:
+            first = told.setdefault(refused[servo], servo)
+            complaints.add((*here, "model"), refused[servo] if first == servo else f"cannot be used, see {first}")
         else:
             _check_servo(here, entry, found[entry.model], complaints)
     return found
+
+
+def _find_models(options: BusOptions, folder: Path) -> tuple[dict[str, ServoModel], dict[str, str]]:
+    """The models by name, and by servo what was refused: when all together are not accepted, each alone is asked for."""
+    models = PROTOCOLS[options.protocol].models
+    found: dict[str, ServoModel] = {}
+    refused: dict[str, str] = {}
+    try:
+        return dict(models(options, folder)), refused
+    except ConfigError:
+        for servo, entry in options.servos.items():
+            try:
+                found.update(models(options.model_copy(update={"servos": {servo: entry}}), folder))
+            except ConfigError as error:
+                refused[servo] = error.message
+    return found, refused
 
 
 def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complaints: Complaints) -> None:
@@ -177,7 +200,7 @@ def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> Non
                 continue
             check_port(options.port)
         except ServobusError as error:
-            complaints.add(path, error.message)
+            complaints.add(path, error.message.replace(repr(options.port), show(options.port)))
             continue
         owner = owners.setdefault(os.path.realpath(options.port), name)
         if owner != name:

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iter
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import anyio
 import structlog
@@ -20,16 +20,15 @@ import structlog
 from servobus.bus.scan import scan
 from servobus.bus.service import BusService
 from servobus.config import Config, load_config
-from servobus.errors import EStopped, LinkDown, PartialFailure, ServobusError, UnknownName
+from servobus.errors import EStopped, LinkDown, UnknownName
 from servobus.links import open_link
 from servobus.links.base import Link
-from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
 from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
-from servobus.rig import Found, Rig, Snapshot
+from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
+from servobus.rig import Found, Rig, Snapshot, outcomes, raise_failures
 from servobus.sim.build import SimLink, simulated_link
 
-R = TypeVar("R")
 Trace = Callable[[str, bool, bytes, float], None]
 """(bus, sent, bytes, monotonic seconds) of everything on the wire."""
 
@@ -68,7 +67,7 @@ class LocalRig(Rig):
         )
         driver = entry.driver(options, models)
         self.links[name] = link
-        self.buses[name] = BusService(name, options, driver, entry.codec(), link.traits, self._event)
+        self.buses[name] = BusService(name, options, driver, entry.codec(options), link.traits, self._event)
         self._tried[name] = asyncio.Event()
 
     @property
@@ -150,7 +149,7 @@ class LocalRig(Rig):
             for bus, part in checked.items()
             for servo, future in bus.motion.put(part, together=together, confirm=confirm).items()
         }
-        return await _outcomes(futures)
+        return await outcomes(futures)
 
     async def enable(self, *names: str) -> None:
         await self._each(names, lambda bus, servo: bus.motion.enable(servo))
@@ -183,12 +182,9 @@ class LocalRig(Rig):
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
         full = self.full_names(names)
-        states = await asyncio.gather(*(self._settle(name, tolerance, timeout) for name in full))
-        return dict(zip(full, states, strict=True))
-
-    async def _settle(self, name: str, tolerance: float | None, timeout: float) -> State:
-        bus, servo = self.bus_of(name)
-        return await bus.motion.settle(servo, tolerance=tolerance, timeout=timeout)
+        places = [self.bus_of(name) for name in full]
+        waits = (bus.motion.settle(servo, tolerance=tolerance, timeout=timeout) for bus, servo in places)
+        return dict(zip(full, await asyncio.gather(*waits), strict=True))
 
     async def _park(self, bus: BusService, servo: str) -> StopReport:
         """To the park pose, then limp; limp also when it does not get there in time."""
@@ -269,29 +265,12 @@ class LocalRig(Rig):
         """Every servo is tried, whatever happens to another."""
         full = self.full_names(names)
         results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
-        _raise_failures(dict(zip(full, results, strict=True)))
+        raise_failures(dict(zip(full, results, strict=True)))
 
     @staticmethod
     def _event(name: str, **fields: Any) -> None:
         quiet = name in {"line_up", "echo_probed", "estop_cleared", "servo_online"}
         (log.info if quiet else log.warning)(name, **fields)
-
-
-async def _outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
-    results = await asyncio.gather(*futures.values(), return_exceptions=True)
-    named = dict(zip(futures, results, strict=True))
-    _raise_failures(named)
-    return {name: result for name, result in named.items() if isinstance(result, Outcome)}
-
-
-def _raise_failures(results: Mapping[str, Any]) -> None:
-    """One result raises its own error; several raise PartialFailure. What is no error of ours is raised as it is."""
-    failures = [result for result in results.values() if isinstance(result, BaseException)]
-    for failure in failures:
-        if not isinstance(failure, ServobusError) or len(results) == 1:
-            raise failure
-    if failures:
-        raise PartialFailure(results)
 
 
 @asynccontextmanager

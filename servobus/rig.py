@@ -7,13 +7,14 @@ ReplyTimeout, UnknownName and Overloaded.
 
 from __future__ import annotations
 
+import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from servobus.errors import UnknownName
-from servobus.protocols.base import Goal, Identity, Outcome, State, StopReport
+from servobus.errors import PartialFailure, ServobusError, UnknownName
+from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
 
 Snapshot = dict[str, State]
 """Every servo's last known state, by full name."""
@@ -43,6 +44,24 @@ def full_name(names: Mapping[str, tuple[str, str]], name: str) -> str:
     if matches:
         raise UnknownName(f"{name!r} is on several buses: say one of {', '.join(matches)}")
     raise UnknownName(f"no servo {name!r}: there are {', '.join(names) or 'none'}")
+
+
+async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
+    """All of them, by name. Raises as `raise_failures`."""
+    results = await asyncio.gather(*futures.values(), return_exceptions=True)
+    named = dict(zip(futures, results, strict=True))
+    raise_failures(named)
+    return {name: result for name, result in named.items() if isinstance(result, Outcome)}
+
+
+def raise_failures(results: Mapping[str, Any]) -> None:
+    """One result raises its own error; several raise PartialFailure. What is no error of ours is raised as it is."""
+    failures = [result for result in results.values() if isinstance(result, BaseException)]
+    for failure in failures:
+        if not isinstance(failure, ServobusError) or len(results) == 1:
+            raise failure
+    if failures:
+        raise PartialFailure(results)
 
 
 class Servo:

@@ -41,6 +41,7 @@ class FineTimer:
         self._loop = loop
         self._callback = callback
         self._handle: asyncio.TimerHandle | None = None
+        self._at: float | None = None
         self._descriptor = -1
         if not getattr(loop, VIRTUAL, False) and hasattr(_libc, "timerfd_create"):
             self._descriptor = _libc.timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC)
@@ -49,14 +50,22 @@ class FineTimer:
 
     def arm(self, when: float) -> None:
         """At `when` (seconds of `clock_of`), instead of any earlier time; at once when that has passed."""
+        self._at = when
         if self._descriptor >= 0:
             self._set(max(1, round(when * 1e9)))
             return
         self.cancel()
-        self._handle = self._loop.call_at(when, self._callback)
+        self._handle = self._loop.call_at(when, self._fire)
+        self._at = when
+
+    def by(self, when: float | None) -> None:
+        """At `when` at the latest: waking early costs little, moving a timer again and again does not. None: no need."""
+        if when is not None and (self._at is None or when < self._at):
+            self.arm(when)
 
     def cancel(self) -> None:
         """Not at all."""
+        self._at = None
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None
@@ -80,4 +89,33 @@ class FineTimer:
             os.read(self._descriptor, 8)
         except BlockingIOError:
             return  # armed anew between the wake and now
+        self._fire()
+
+    def _fire(self) -> None:
+        self._at = None
+        self._callback()
+
+
+class CoarseTimer:
+    """The same by the loop's own timers, whole milliseconds at best: for moments that hardly ever come, like deadlines. It is
+    never moved to a later one, so whoever is called too early asks again."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
+        self._loop = loop
+        self._clock = clock_of(loop)
+        self._callback = callback
+        self._handle: asyncio.TimerHandle | None = None
+        self._at = 0.0
+
+    def by(self, when: float) -> None:
+        """At `when` (seconds of `clock_of`) at the latest."""
+        if self._handle is not None:
+            if self._at <= when:
+                return
+            self._handle.cancel()
+        self._at = when
+        self._handle = self._loop.call_later(max(0.0, when - self._clock()), self._fire)
+
+    def _fire(self) -> None:
+        self._handle = None
         self._callback()

@@ -229,8 +229,7 @@ class _Builder:
             self._refuse(event, f"found more than {MAX_NODES} keys and values; split the file")
         if isinstance(event, AliasEvent):
             self._refuse(event, "found an alias (*name); write the value out")
-        if not isinstance(event, (ScalarEvent, CollectionStartEvent)):
-            return
+        assert isinstance(event, (ScalarEvent, CollectionStartEvent)), "there are no other nodes"
         if event.anchor is not None:
             self._refuse(event, "found an anchor (&name); take it out and write the value where it is needed")
         if event.tag is not None:

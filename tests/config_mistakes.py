@@ -58,5 +58,14 @@ MISTAKES = {
     "faults on a real line": Mistake(
         'port: "sim:"', "port: /dev/ttyS9\n    faults: {loss: 0.1}", 3, 3, "faults are for a simulated line"
     ),
+    "limits beyond its reach": Mistake(
+        "[-90, 90]", "[-90, 9000]", 9, 45, "buses.arm.servos.shoulder.limits: found 9000; model sts reaches -3059.91 to 2699.91"
+    ),
+    "too many limits": Mistake("[-90, 90]", "[-90, 0, 90]", 9, 45, "shoulder.limits: found 3 here; write at most 2"),
+    "limits that are no list": Mistake("[-90, 90]", "90", 9, 45, "found 90; expected a list"),
+    "number as a name": Mistake("elbow:", "7:", 10, 7, "found 7 as a name; put it in quotes"),
+    "number as a bus": Mistake("  arm:", "  7:", 3, 3, "buses.7: found 7 as a name; put it in quotes"),
+    "number as a port": Mistake('"sim:"', "7", 5, 11, "found 7; expected text; a number stands in quotes"),
+    "list as a port": Mistake('"sim:"', "[a]", 5, 5, "buses.arm.port: expected text"),
     "bad address": Mistake('port: "sim:"', "port: tcp://nowhere", 5, 11, "tcp://HOST:PORT"),
 }

@@ -22,9 +22,9 @@ from servobus.errors import (
     UnknownName,
 )
 from servobus.local import LocalRig, open_rig
-from servobus.protocols.base import Goal, Outcome
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.device import SmsDevice
+from servobus.protocols.words import Goal, Outcome
 from tests.rigs import config, devices
 from tests.virtual import virtual
 

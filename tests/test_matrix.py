@@ -11,7 +11,7 @@ import pytest
 
 from servobus.errors import ServobusError
 from servobus.local import LocalRig, open_rig
-from servobus.protocols.base import Outcome
+from servobus.protocols.words import Outcome
 from tests.rigs import config, pty_rig
 from tests.virtual import virtual
 

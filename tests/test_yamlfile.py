@@ -62,6 +62,8 @@ def test_windows_line_ends_and_a_first_marker() -> None:
         ("a: [1", "this is not YAML"),
         ("a: 'x", "this is not YAML"),
         ('a: "\\xZZ"', "not YAML"),
+        ('a: "\\U00110000"', "check escapes in double quotes"),
+        ('a: "\\uD800"', "in this text found the control character U+D800"),
         ("? [1]\n: 2", "found a list or a mapping as a key"),
         ("<<: {a: 1}", "found a merge key"),
         ("1.5: x", "found 1.5 as a key"),

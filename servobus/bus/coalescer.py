@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 from servobus.errors import ActionWithheld, GoalExpired, ServobusError
-from servobus.protocols.base import Outcome, ServoGoal
+from servobus.protocols.words import Outcome, ServoGoal
 
 
 def _never() -> bool:

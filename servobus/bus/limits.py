@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from servobus.errors import LimitError
-from servobus.protocols.base import Goal, is_number
 from servobus.protocols.options import ServoOptions
+from servobus.protocols.words import Goal, is_number
 
 
 def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:

@@ -13,6 +13,8 @@ QUIET = 0.002
 """Seconds without a byte after which the line counts as quiet."""
 START_QUIET = 0.020
 """After opening: a servo may still be answering somebody else, or hold half a frame."""
+HALF_AGAIN = 1.0
+"""Seconds of half duplex after a missing answer."""
 BABBLE = 0.250
 """Seconds of uninterrupted talk after which it is no late reply any more."""
 ECHO_LIMIT = 4096
@@ -54,11 +56,26 @@ class EchoFilter:
 class Line:
     """The state of one half-duplex line as its master knows it."""
 
-    __slots__ = ("_last_start", "_listening_since", "_quiet_at", "babbling", "drains", "echo", "sent_by", "traits")
+    __slots__ = (
+        "_last_start",
+        "_listening_since",
+        "_quiet_at",
+        "babbling",
+        "drains",
+        "echo",
+        "half_until",
+        "sent_by",
+        "spread",
+        "traits",
+    )
 
     def __init__(self, traits: LineTraits) -> None:
         self.traits = traits
         self.echo: EchoFilter | None = None
+        self.spread: float | None = None
+        """On four wires: seconds by which the pauses before two servos' answers may differ. None: half duplex."""
+        self.half_until = 0.0
+        """Half duplex all the same, after an answer was missing."""
         self.babbling = False
         """It has talked without a pause for too long, and has not been quiet since; only an e-stop is still said."""
         self.drains = 0
@@ -100,6 +117,13 @@ class Line:
         if self.babbling and urgent:  # an e-stop is not held back by a node that never stops talking
             return self._last_start
         return max(self._quiet_at, self._last_start)
+
+    def next_at(self, size: int, now: float) -> float | None:
+        """When a frame may be handed over behind one whose answer is due: so much later that the answers (of `size` bytes) cannot
+        meet. None: not before that answer is here."""
+        if self.spread is None or now < self.half_until or self._listening_since is not None:
+            return None
+        return max(self._quiet_at, self._last_start + size * self.traits.byte_time + self.spread)
 
     def quiet(self) -> None:
         """It was listened out, and is about to be spoken on."""

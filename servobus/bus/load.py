@@ -12,8 +12,9 @@ from typing import Any
 
 from servobus.bus.health import FIRST_DEADLINE
 from servobus.bus.line import QUIET
-from servobus.protocols.base import Driver, Goal, LineTraits, Request, ServoGoal, StopTarget, run_plan
+from servobus.protocols.base import Driver, LineTraits, Request, run_plan
 from servobus.protocols.options import BusOptions, ServoOptions
+from servobus.protocols.words import Goal, ServoGoal, StopTarget
 
 TURNAROUND = 0.0005
 """Seconds assumed between a question and its answer: what FEETECH servos are shipped with (return delay 250 of 2 us)."""

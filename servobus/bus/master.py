@@ -13,14 +13,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
-from servobus.bus.line import QUIET, Line
+from servobus.bus.line import HALF_AGAIN, QUIET, Line
 from servobus.bus.queue import Job
 from servobus.bus.runner import Runner
 from servobus.bus.turn import Turn, judge
 from servobus.errors import LinkDown
 from servobus.links.base import Transport
 from servobus.protocols.base import Codec, Reply, Request
-from servobus.timerfd import FineTimer, clock_of
+from servobus.timerfd import CoarseTimer, FineTimer, clock_of
 
 CLOSE_TIMEOUT = 0.5
 """Seconds for the last bytes to leave."""
@@ -46,16 +46,15 @@ class BusMaster(asyncio.Protocol):
         self._clock = clock_of(self._loop)
         self._transport: Transport | None = None
         self._closed: asyncio.Future[None] = self._loop.create_future()
-        self._turn: Turn | None = None
-        self._deadline: asyncio.TimerHandle | None = None
-        self._deadline_at = 0.0
+        self._flight: list[Turn] = []
+        """The turns under way, oldest first: one, or on four wires one for each of several nodes."""
+        self._deadline = CoarseTimer(self._loop, self._on_deadline)
         self._wake = FineTimer(self._loop, self._on_wake)
-        self._wake_at: float | None = None
         self._pump_due = False
 
     def __repr__(self) -> str:
         servos = sum(node.configured for node in self._health.nodes.values())
-        return f"{self.name}: {servos} servos, {int(self._turn is not None)} in flight, {self._scheduler.waiting()} queued"
+        return f"{self.name}: {servos} servos, {len(self._flight)} in flight, {self._scheduler.waiting()} queued"
 
     # Callers
 
@@ -68,7 +67,7 @@ class BusMaster(asyncio.Protocol):
         if self._transport is None:
             raise LinkDown("the line is down: it is opened again as soon as the port is there", bus=self.name)
         self._scheduler.submit(job, self._clock())
-        if self._turn is None and self.runner.idle:
+        if self.runner.idle and (not self._flight or self.line.spread is not None):
             self._pump()
 
     def submit_estop(self, job: Job) -> None:
@@ -81,7 +80,7 @@ class BusMaster(asyncio.Protocol):
 
     def goals_waiting(self) -> None:
         """Goals were put: they leave after this pass of the loop, together with all others put in it."""
-        if self._turn is None and not self._pump_due:
+        if not self._pump_due and (not self._flight or self.line.spread is not None):
             self._pump_due = True
             self._loop.call_soon(self._on_wake)
 
@@ -120,11 +119,10 @@ class BusMaster(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
-        self._turn = None
-        self._wake_at = None
+        flight, self._flight = self._flight, []
         self._wake.cancel()
         self._counts["line_lost"] += exc is not None
-        self.runner.lost(str(exc) if exc else "closed")
+        self.runner.lost(str(exc) if exc else "closed", flight)
         if not self._closed.done():
             self._closed.set_result(None)
 
@@ -138,13 +136,14 @@ class BusMaster(asyncio.Protocol):
             data = line.echo.strip(data)
             if not data:
                 return
-        turn = self._turn
-        if turn is None or (line.traits.paced and now < turn.sent_by):
+        flight = self._flight
+        if not flight or (line.traits.paced and now < flight[0].sent_by):
             self._unsolicited(data, now)
             return
         self._codec.receive_data(data)
         strays: list[Reply] = []
-        believed = judge(self._codec, turn, strays)
+        turn = flight[0]
+        believed = judge(self._codec, turn, strays, flight[1:])
         if strays:
             self.runner.strays(strays, turn, now)
         if believed:
@@ -162,7 +161,7 @@ class BusMaster(asyncio.Protocol):
         while (reply := self._codec.next_reply()) is not None:
             strays.append(reply)
         self.runner.strays(strays, None, now)
-        if self._turn is None:
+        if not self._flight:
             self.line.listen_out(now)
             self._pump()  # who spoke is to be asked again, when it is quiet
 
@@ -170,14 +169,18 @@ class BusMaster(asyncio.Protocol):
 
     def _pump(self) -> None:
         """Say whatever may be said now, and make sure to be woken for what may be said later."""
-        while self._transport is not None and self._turn is None:
+        while self._transport is not None:
+            if self._flight:
+                if self.line.spread is None or not self._follow(self._clock()):
+                    return
+                continue
             now = self._clock()
             ready = self.line.ready_at(now, urgent=self.runner.urgent)
             if ready > now:
                 if self.line.babbling:
                     self.runner.babbled()
                 self._scheduler.expire(now)
-                self._arm(ready)
+                self._wake.by(ready)
                 return
             if self.line.listening_out:
                 self._codec.reset()
@@ -185,9 +188,25 @@ class BusMaster(asyncio.Protocol):
             request = self.runner.next_request(now)
             if request is None:
                 self._scheduler.expire(now)
-                self._arm(self._scheduler.wake())
+                self._wake.by(self._scheduler.wake())
                 return
             self._transmit(request, now)
+
+    def _follow(self, now: float) -> bool:
+        """On four wires: say the next while the answers to the last are due. False: not now."""
+        last = self._flight[-1]
+        at = self.line.next_at(last.request.reply_size, now) if last.run is not None else None
+        if at is None:
+            return False
+        if at > now:
+            self._wake.by(at)
+            return False
+        request = self.runner.next_request(now, [turn.request.node for turn in self._flight])
+        if request is None:
+            self._wake.by(self._scheduler.wake())
+            return False
+        self._transmit(request, now)
+        return True
 
     def _transmit(self, request: Request[Any], now: float) -> None:
         assert self._transport is not None
@@ -207,11 +226,14 @@ class BusMaster(asyncio.Protocol):
         wire = request.replies * request.reply_size * byte_time
         self._stats.busy += len(frame) * byte_time + wire
         deadline = line.sent_by + wire + self._allowance(request)
-        self._turn = Turn(request, sent_at=start, sent_by=line.sent_by, deadline=deadline)
-        self._codec.reset()
+        turn = Turn(request, sent_at=start, sent_by=line.sent_by, deadline=deadline)
+        if not self._flight:
+            self._codec.reset()
+        self._flight.append(turn)
+        if line.spread is not None:
+            self.runner.release(turn)
         self._transport.write(frame)
-        if self._deadline is None or self._deadline_at > deadline:
-            self._set_deadline(deadline)
+        self._deadline.by(deadline)
 
     def _allowance(self, request: Request[Any]) -> float:
         """Seconds beyond the wire time that the answers may take."""
@@ -221,21 +243,30 @@ class BusMaster(asyncio.Protocol):
         return slowest + self.line.traits.latency + request.service_time
 
     def _answered(self, turn: Turn, now: float) -> None:
-        self._turn = None
+        self._flight.remove(turn)
         self._counts["turns"] += 1
         self._counts["echoes"] += turn.echoes
         self._stats.turns.add(now - turn.sent_at)
-        self.line.answered(now, turn.request.quiet_after)
+        if not self._flight:
+            self.line.answered(now, turn.request.quiet_after)
         self.runner.answered(turn, now, self._latency(turn, now))
-        self._pump()
+        self._go_on(now)
 
     def _missed(self, turn: Turn, now: float) -> None:
-        self._turn = None
+        self._flight.remove(turn)
         self._counts["timeouts"] += 1
         self._counts["echoes"] += turn.echoes
+        self.line.half_until = now + HALF_AGAIN
         self.line.listen_out(now, max(QUIET, turn.request.quiet_after))
         self.runner.missed(turn, now, self._latency(turn, now))
-        self._pump()
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> None:
+        """With what came for the next turn while this one was waited for; else with what is to be said."""
+        if self._flight and self._flight[0].complete():
+            self._answered(self._flight[0], now)
+        else:
+            self._pump()
 
     def _latency(self, turn: Turn, now: float) -> float:
         """What the answers took beyond the wire time."""
@@ -243,38 +274,22 @@ class BusMaster(asyncio.Protocol):
 
     # Time
 
-    def _arm(self, when: float | None) -> None:
-        """Wake at `when` at the latest; waking early costs little, moving a timer at every turn does not."""
-        if when is not None and (self._wake_at is None or when < self._wake_at):
-            self._wake_at = when
-            self._wake.arm(when)
-
     def _on_wake(self) -> None:
         self._pump_due = False
-        self._wake_at = None
         self._pump()
-
-    def _set_deadline(self, when: float) -> None:
-        if self._deadline is not None:
-            self._deadline.cancel()
-        self._deadline_at = when
-        self._deadline = self._loop.call_later(max(0.0, when - self._clock()), self._on_deadline)
 
     def _on_deadline(self) -> None:
         """The timer is not moved at each turn, so it may be early for the present one."""
-        self._deadline = None
-        turn = self._turn
-        if turn is None or self._transport is None:
+        if not self._flight or self._transport is None:
             return
+        turn = self._flight[0]
         if self._clock() >= turn.deadline and not turn.looked:
             # What has arrived and was not read yet is not late.
             turn.looked = True
             if not self._transport.look():
                 turn.deadline = self._clock() + SECOND_LOOK
-        if self._turn is not turn:
-            return
         now = self._clock()
-        if now >= turn.deadline:
+        if turn in self._flight and now >= turn.deadline:
             self._missed(turn, now)
-        else:
-            self._set_deadline(turn.deadline)
+        if self._flight:
+            self._deadline.by(self._flight[0].deadline)

@@ -19,7 +19,7 @@ from servobus.bus.limits import check_goal
 from servobus.bus.queue import Job
 from servobus.bus.record import ServoRecord
 from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError
-from servobus.protocols.base import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
+from servobus.protocols.words import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
 
 if TYPE_CHECKING:
     from servobus.bus.service import BusService
@@ -69,6 +69,7 @@ class Motion:
             ticket = self._ticket(bus.records[servo], goal, future)
             ticket.batch, ticket.confirm, ticket.gone = batch, confirm, future.cancelled
             bus.stats.counts["goals"] += 1
+            self._pace(ticket)
             bus.scheduler.coalescer.put(ticket)
             futures[servo] = future
         if bus.master.up:
@@ -76,6 +77,14 @@ class Motion:
         else:
             bus.scheduler.coalescer.drop(lambda servo: LinkDown("the line is down: nothing was sent", bus=bus.name, servo=servo))
         return futures
+
+    def _pace(self, ticket: Ticket) -> None:
+        """Where the servo keeps no speed, the host does; any way it was being led on ends."""
+        profile, speed = self._bus.scheduler.profile, self._bus.driver.pace(ticket.goal)
+        if speed is None:
+            profile.drop({ticket.servo})
+        else:
+            profile.begin(ticket, speed, self._bus.clock())
 
     def _ticket(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome]) -> Ticket:
         now = self._bus.clock()
@@ -111,6 +120,7 @@ class Motion:
         if self.latched:
             raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
         record.setpoint = present
+        self._bus.scheduler.profile.forget(servo)
         self._set_enabled(record, True)
 
     async def disable(self, servo: str) -> None:
@@ -168,7 +178,7 @@ class Motion:
         while True:
             state = await bus.read(servo, SETTLE_PERIOD)
             there = record.setpoint is None or (state.position is not None and abs(state.position - record.setpoint) <= near)
-            if there and not state.moving:
+            if there and not state.moving and not bus.scheduler.profile.leads(servo):
                 return state
             if bus.clock() >= end:
                 raise DeviceError(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from servobus.bus.health import Node
-from servobus.protocols.base import Identity, State, Update
 from servobus.protocols.options import ServoOptions
+from servobus.protocols.words import Identity, State, Update
 
 
 class ServoRecord:

@@ -7,7 +7,7 @@ The master asks `next_request` when the line is free, and reports how the turn e
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any
 
@@ -42,10 +42,13 @@ class Runner:
 
     # What is said next
 
-    def next_request(self, now: float) -> Request[Any] | None:
-        """What shall be said now: the next frame of the plan under way, or of the next job. None: nothing is due."""
+    def next_request(self, now: float, busy: Collection[int] = ()) -> Request[Any] | None:
+        """What shall be said now: the next frame of the plan under way, or of the next job. None: nothing is due, or (while
+        answers of `busy` nodes are due) nothing that could be said before they are here."""
         while (run := self._current(now)) is not None:
             request = run.request
+            if busy and not (run.single and request.node not in busy and self._doubtful(request) is None):
+                return None
             if not request.replies or run.recovering:
                 return request
             doubtful = self._doubtful(request)
@@ -56,6 +59,11 @@ class Runner:
             recovery = self.scheduler.recovery(doubtful)
             self._step(run, partial(run.detour, recovery))
         return None
+
+    def release(self, turn: Turn) -> None:
+        """Others may follow before this turn ends, if it is all that its job needs."""
+        if self._run is not None and self._run.single:
+            turn.run, self._run = self._run, None
 
     def _doubtful(self, request: Request[Any]) -> Any:
         for node_id in request.nodes:
@@ -95,7 +103,8 @@ class Runner:
 
     def sent(self, request: Request[Any]) -> None:
         """It left, and no answer is due."""
-        self._resolve(request.parse(()))
+        assert self._run is not None
+        self._resolve(self._run, request.parse(()))
 
     def answered(self, turn: Turn, now: float, latency: float) -> None:
         """All answers are here."""
@@ -134,10 +143,10 @@ class Runner:
             if node.configured or (turn is not None and reply.node in turn.request.nodes):
                 self.health.doubt(node, reply.key, node.outstanding.get(reply.key, now))
 
-    def lost(self, cause: str) -> None:
+    def lost(self, cause: str, flight: Sequence[Turn] = ()) -> None:
         """The line is gone: everything ends."""
         run, suspended, self._run, self._suspended = self._run, self._suspended, None, None
-        for begun in (run, suspended):
+        for begun in (run, suspended, *(turn.run for turn in flight)):
             if begun is not None:
                 message = f"the line went down while this was under way ({cause}): it may have been applied"
                 begun.job.fail(LinkDown(message, bus=self.bus))
@@ -152,25 +161,29 @@ class Runner:
         try:
             value = turn.request.parse(turn.replies)
         except Exception as error:  # noqa: BLE001 - whatever it is, its caller is told
-            self._fail(error)
+            self._fail(self._run_of(turn), error)
         else:
-            self._resolve(value)
+            self._resolve(self._run_of(turn), value)
+
+    def _run_of(self, turn: Turn) -> Run:
+        run = turn.run or self._run
+        assert run is not None
+        return run
 
     def _again(self, turn: Turn) -> None:
         """Say it once more, or give it up."""
-        run, request = self._run, turn.request
-        assert run is not None
+        run, request = self._run_of(turn), turn.request
         run.attempts += 1
         offline = any(self.health.node(node).condition is Condition.OFFLINE for node in request.nodes)
         # A recovery is never repeated in the middle: what it asked may still be answered, and must be fenced again.
         if not request.idempotent or run.recovering or run.attempts >= run.job.tries or offline:
-            self._fail(self._timeout(run.attempts, request), offline=offline)
+            self._fail(run, self._timeout(run.attempts, request), offline=offline)
             return
         self.stats.counts["retries"] += 1
         run.request = (request.plain() if turn.echoes else None) or request
         if run.job.plan is None:
             # It stays the first of its node, and the other nodes have their turns before it.
-            self._run = None
+            self._let_go(run)
             run.job.attempts, run.job.request = run.attempts, run.request
             self.scheduler.retry(run.job)
 
@@ -185,18 +198,19 @@ class Runner:
 
     # The run
 
-    def _resolve(self, value: Any) -> None:
-        run = self._run
-        assert run is not None
+    def _resolve(self, run: Run, value: Any) -> None:
         if run.simple:
-            self._run = None
+            self._let_go(run)
             run.job.succeed(value)
             return
         self._step(run, partial(run.succeed, value))
 
-    def _fail(self, error: Exception, *, offline: bool = False) -> None:
-        run = self._run
-        assert run is not None
+    def _let_go(self, run: Run) -> None:
+        """It has the line no longer, if it had it."""
+        if self._run is run:
+            self._run = None
+
+    def _fail(self, run: Run, error: Exception, *, offline: bool = False) -> None:
         self._step(run, partial(run.fail, error, offline=offline))
 
     def _step(self, run: Run, step: Callable[[], bool | None]) -> None:
@@ -207,10 +221,10 @@ class Runner:
                 return
             error: Exception = NotEnabled("the servo has restarted and is disabled: nothing was sent; enable it again")
         except Finished as end:
-            self._run = None
+            self._let_go(run)
             run.job.succeed(end.value)
             return
         except Exception as raised:  # noqa: BLE001 - a mistake in a driver ends its job, never the bus
             error = raised
-        self._run = None
+        self._let_go(run)
         run.job.fail(error.at(bus=self.bus) if isinstance(error, ServobusError) else error)

@@ -16,9 +16,11 @@ from typing import Any
 
 from servobus.bus.coalescer import Coalescer, Group, Ticket
 from servobus.bus.health import Condition, Health, Node
+from servobus.bus.profile import Profile
 from servobus.bus.queue import Callback, Job, RequestQueue, overloaded
 from servobus.errors import ReplyTimeout, ServobusError
-from servobus.protocols.base import Driver, GoalTurn, Outcome, Plan, Poll
+from servobus.protocols.base import Driver, GoalTurn, Plan, Poll
+from servobus.protocols.words import Outcome
 
 QUEUE_LIMIT = 1024
 """Jobs that may wait on one bus."""
@@ -55,11 +57,14 @@ class Scheduler:
         *,
         on_update: Callable[[Any], None],
         on_restart: Callable[[Node], None],
+        on_cut: Callable[[str, Exception], None],
+        cycle: float,
         limit: int = QUEUE_LIMIT,
     ) -> None:
         self.driver = driver
         self.health = health
         self.coalescer = Coalescer()
+        self.profile = Profile(cycle, on_cut)
         self.requests = RequestQueue(limit)
         self.estop: deque[Job] = deque()
         self.session: object = None
@@ -144,7 +149,7 @@ class Scheduler:
         times = [self.requests.next_expiry(), self.coalescer.next_expiry()]
         times.append(self._parked_until if self._parked else None)
         if self.session is None:
-            times.append(self.health.next_probe())
+            times += (self.health.next_probe(), self.profile.next_due())
             times.append(self._poll_due if self._polls else None)
         return min((time for time in times if time is not None), default=None)
 
@@ -191,6 +196,7 @@ class Scheduler:
             else:
                 self._goal_jobs.append((job, tickets))
         self.coalescer.drop(error, servos)
+        self.profile.drop(servos)
 
     def drop(self, error: Callable[[str], ServobusError], *, motion_only: bool) -> None:
         """End everything that waits, or only what would move something."""
@@ -206,6 +212,8 @@ class Scheduler:
     # The lanes
 
     def _next_goal(self, now: float) -> Job | None:
+        for ticket in self.profile.due(now):
+            self.coalescer.put(ticket)
         while self._goal_jobs or self._plan_goals(now):
             job, tickets = self._goal_jobs.popleft()
             ready = self.health.reachable()

@@ -21,8 +21,9 @@ from servobus.bus.runner import Runner
 from servobus.bus.scheduler import Scheduler
 from servobus.bus.stats import BusStats
 from servobus.errors import LeaseHeld, LinkDown, NotSupported, ReplyTimeout, ServobusError
-from servobus.protocols.base import Codec, Driver, Identity, LineTraits, Plan, Request, State, Update
+from servobus.protocols.base import Codec, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
+from servobus.protocols.words import Identity, State, Update
 from servobus.timerfd import clock_of
 
 R = TypeVar("R")
@@ -52,8 +53,16 @@ class BusService:
         greatest = {} if options.timeout_ms is None else {"greatest_deadline": options.timeout_ms / 1000}
         self.health = Health(set(driver.nodes.values()), changed=self._changed, **greatest)
         self.stats = BusStats(self.clock())
-        self.scheduler = Scheduler(driver, self.health, on_update=self._polled, on_restart=self._restarted)
+        self.scheduler = Scheduler(
+            driver,
+            self.health,
+            on_update=self._polled,
+            on_restart=self._restarted,
+            on_cut=self._cut,
+            cycle=options.rate_of_goals,
+        )
         self.line = Line(traits)
+        self.line.spread = options.spread
         if options.echo == "on":
             self.line.echo = EchoFilter()
         self.master = BusMaster(name, codec, Runner(name, self.scheduler, self.health, self.stats), self.line)
@@ -230,6 +239,10 @@ class BusService:
         now = self.clock()
         for servo, fields in result.items():
             self.records[servo].update(fields, now)
+
+    def _cut(self, servo: str, error: Exception) -> None:
+        """The host led this servo, and a setpoint failed on the way."""
+        self.event("motion_cut", bus=self.name, servo=servo, reason=str(error))
 
     def _restarted(self, node: Node) -> None:
         self.stats.counts["restarts"] += 1

@@ -8,7 +8,7 @@ when it was the last the whole window is rejected.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from servobus.bus.queue import Job
@@ -19,7 +19,7 @@ from servobus.protocols.base import Codec, Plan, Reply, Request
 class Turn:
     """One request under way."""
 
-    __slots__ = ("deadline", "echoes", "looked", "replies", "request", "sent_at", "sent_by", "skipped", "torn")
+    __slots__ = ("deadline", "echoes", "looked", "replies", "request", "run", "sent_at", "sent_by", "skipped", "torn")
 
     def __init__(self, request: Request[Any], *, sent_at: float, sent_by: float, deadline: float) -> None:
         self.request = request
@@ -28,6 +28,8 @@ class Turn:
         self.sent_by = sent_by
         """When its last byte has left."""
         self.deadline = deadline
+        self.run: Run | None = None
+        """Whose turn it is, where others may follow before it ends."""
         self.replies: list[Any] = []
         self.echoes = 0
         self.looked = False
@@ -92,6 +94,11 @@ class Run:
     def simple(self) -> bool:
         """One request and nothing around it."""
         return self.job.plan is None and self._detour is None
+
+    @property
+    def single(self) -> bool:
+        """One request that one node answers, and nothing around it: others may be said before it is answered."""
+        return self.simple and not self.recovering and len(self.request.nodes) == self.request.replies == 1
 
     def begin(self) -> None:
         """Find the first request. Raises Finished, or the plan's error."""
@@ -166,12 +173,13 @@ def _throw(plan: Plan[Any], error: Exception) -> Request[Any]:
         raise Finished(stop.value) from None
 
 
-def judge(codec: Codec, turn: Turn, strays: list[Reply]) -> bool:
-    """Hear out what the codec holds. True: the turn has all its answers, and the window ends with a whole frame."""
+def judge(codec: Codec, turn: Turn, strays: list[Reply], following: Sequence[Turn] = ()) -> bool:
+    """Hear out what the codec holds for the oldest turn under way and those that follow. True: the turn has all its answers, and
+    the window ends with a whole frame, or with the beginning of an answer that is still due."""
     while (reply := codec.next_reply()) is not None:
         if codec.skipped != turn.skipped:
             turn.tear()
             turn.skipped = codec.skipped
-        if not turn.offer(reply):
+        if not (turn.offer(reply) or (following and any(other.offer(reply) for other in following))):
             strays.append(reply)
-    return turn.complete() and not codec.pending and codec.skipped == turn.skipped
+    return turn.complete() and codec.skipped == turn.skipped and (bool(following) or not codec.pending)

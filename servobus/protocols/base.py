@@ -6,12 +6,12 @@ generator that yields requests and is sent what they returned, or has their erro
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar
+
+from servobus.protocols.words import Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
@@ -146,115 +146,6 @@ def run_plan(plan: Plan[R], exchange: Callable[[Request[Any]], Any]) -> R:
         return result
 
 
-class Outcome(StrEnum):
-    """How a goal ended that did not fail."""
-
-    ACKED = "acked"
-    """The servo confirmed it."""
-    SENT = "sent"
-    """It left, and the protocol has no answer to it."""
-    SUPERSEDED = "superseded"
-    """A newer goal of the same servo took its place before it left."""
-
-
-GoalKind: TypeAlias = Literal["position", "velocity"]
-
-
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """Where a servo shall go. Positions in the servo's unit, speeds in unit/s, times in seconds."""
-
-    kind: GoalKind
-    value: float
-    speed: float | None = None
-    """Unit/s on the way; None: the servo's own setting."""
-    duration: float | None = None
-    """Seconds the way shall take; not together with speed."""
-    acceleration: float | None = None
-    """Unit/s^2; None: the servo's own setting."""
-    effort: float | None = None
-    """Percent of the greatest torque."""
-    deadline: float | None = None
-    """Seconds from acceptance within which its first byte must leave; None: the servo's `ttl`."""
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """position = direction * (raw - zero) * unit_per_step, as DESIGN section 7 rules."""
-
-    zero: float
-    direction: int
-    unit_per_step: float
-
-    def to_unit(self, raw: float) -> float:
-        return self.direction * (raw - self.zero) * self.unit_per_step + 0.0  # never -0.0
-
-    def to_raw(self, position: float) -> int:
-        """Nearest step, ties to even."""
-        return round(self.zero + self.direction * position / self.unit_per_step)
-
-    def rate_to_unit(self, steps: float) -> float:
-        """Steps/s to unit/s, with the direction."""
-        return self.direction * steps * self.unit_per_step + 0.0
-
-    def rate_to_raw(self, rate: float) -> float:
-        """Unit/s to steps/s, with the direction, not rounded."""
-        return self.direction * rate / self.unit_per_step
-
-
-Update: TypeAlias = dict[str, Any]
-"""Fields of `State` as one reply brought them."""
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """What is known of a servo. Absent is None. Position, goal in its unit; speed unit/s; load %; A; V; Celsius."""
-
-    position: float | None = None
-    goal: float | None = None
-    speed: float | None = None
-    load: float | None = None
-    current: float | None = None
-    voltage: float | None = None
-    temperature: float | None = None
-    moving: bool | None = None
-    enabled: bool = False
-    faults: tuple[str, ...] = ()
-    status: int | None = None
-    health: str = "offline"
-    """online, doubtful or offline."""
-    time: float | None = None
-    """Monotonic seconds of the newest field."""
-    age: float | None = None
-    """Seconds since `time` when this was made."""
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """What a servo says of itself; None where the protocol does not tell."""
-
-    model: str | None = None
-    """Name of a model file that fits."""
-    product: str | None = None
-    firmware: str | None = None
-    mode: GoalKind | None = None
-    energised: bool | None = None
-    limits: tuple[float, float] | None = None
-    """The servo's own stored limits, in its unit."""
-    notes: tuple[str, ...] = ()
-    """What a person should know: settings that do not fit the config."""
-
-
-@dataclass(frozen=True, slots=True)
-class ServoGoal:
-    """One goal of one servo, checked, on its way to the wire."""
-
-    servo: str
-    goal: Goal
-    start: float | None = None
-    """The last known position, for a duration that has to become a speed."""
-
-
 @dataclass(frozen=True, slots=True)
 class GoalTurn:
     """What the wire sees of some goals: one uninterrupted plan that ends in an outcome or an error per servo."""
@@ -262,31 +153,6 @@ class GoalTurn:
     servos: tuple[str, ...]
     plan: Plan[dict[str, Outcome | Exception]]
     frames: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class StopTarget:
-    """A servo an e-stop must reach."""
-
-    servo: str
-    kind: Literal["hold", "limp"]
-    enabled: bool
-    """Enabled by us; None is not known here: an unenabled servo is asked before it is held."""
-    position: float | None = None
-    """The present position, if it is fresh enough to be written at once."""
-    reachable: bool = True
-    """False: known to be offline; it is written to, and not waited for."""
-
-
-@dataclass(frozen=True, slots=True)
-class StopReport:
-    """What an e-stop, a disable or an exit did to one servo."""
-
-    action: str
-    """hold, limp, park, or none (it was limp already)."""
-    written: bool
-    confirmed: bool
-    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,6 +215,9 @@ class Driver(Protocol):
     def check_goal(self, goal: ServoGoal) -> None:
         """Raise LimitError or NotSupported for what the model or the wire cannot carry."""
 
+    def pace(self, goal: ServoGoal) -> float | None:
+        """The speed (unit/s) that the host must keep on the way to this goal; None: the servo's own, or none at all."""
+
     def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
         """The fewest turns that carry these goals; with `together` one turn. Raises NotSupported."""
 
@@ -379,13 +248,3 @@ class Device(Protocol):
 
     def handle(self, packet: Any, now: float) -> Sequence[DeviceReply]:
         """A whole valid frame was on the line (for this node or another); `now` in monotonic seconds."""
-
-
-def is_number(value: object) -> bool:
-    """A finite number that is no boolean."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer no float can hold
-        return False

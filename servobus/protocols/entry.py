@@ -21,11 +21,11 @@ class ProtocolEntry:
     """Its YAML keys."""
     models: Callable[[Any, Path], Mapping[str, ServoModel]]
     """(options, the config's folder) -> every model its servos name, by that name. Raises ConfigError."""
-    codec: Callable[[], Codec]
-    """For the master's end of the line."""
+    codec: Callable[[Any], Codec]
+    """For the master's end of the line, with the options of its bus; None: as the documents have it."""
     driver: Callable[[Any, Mapping[str, Any]], Driver]
-    device_codec: Callable[[], Codec]
-    """For the devices' end of the line."""
+    device_codec: Callable[[Any], Codec]
+    """For the devices' end of the line, likewise."""
     devices: Callable[[Any, Mapping[str, Any]], Sequence[Device]]
     """The simulated halves of the bus's servos."""
     rename: Callable[[bytes, Random], bytes]

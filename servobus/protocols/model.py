@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from servobus.errors import LimitError, NotSupported, UnknownName
-from servobus.protocols.base import is_number
+from servobus.protocols.words import is_number
 
 T = TypeVar("T")
 Pair = Annotated[tuple[T, T], BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)]
@@ -21,9 +21,10 @@ Pair = Annotated[tuple[T, T], BeforeValidator(lambda value: tuple(value) if isin
 
 
 class Data(BaseModel):
-    """Frozen, strict, and deaf to unknown keys: how every model and config file is read."""
+    """Frozen, strict, and deaf to unknown keys: how every model and config file is read. What stands under a key explains it in
+    editors too, through the schema."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
 
 
 class Register(Data):
@@ -56,10 +57,15 @@ class Register(Data):
         return self.address + self.size
 
     @property
+    def room(self) -> tuple[int, int]:
+        """Least and greatest raw value that the bytes can hold."""
+        greatest = (1 << self.sign_bit) - 1 if self.sign_bit is not None else (1 << 8 * self.size) - 1
+        return (-greatest if self.sign_bit is not None else 0, greatest)
+
+    @property
     def span(self) -> tuple[int, int]:
         """Least and greatest raw value that can be written."""
-        greatest = (1 << self.sign_bit) - 1 if self.sign_bit is not None else (1 << 8 * self.size) - 1
-        least = -greatest if self.sign_bit is not None else 0
+        least, greatest = self.room
         return (least if self.minimum is None else self.minimum, greatest if self.maximum is None else self.maximum)
 
     def decode(self, data: bytes, byte_order: Literal["little", "big"]) -> int:
@@ -102,7 +108,7 @@ class ServoModel(Data):
     title: str
     byte_order: Literal["little", "big"] = "little"
     registers: dict[str, Register]
-    units: dict[str, Annotated[float, Field(gt=0)]]
+    units: Annotated[dict[str, Annotated[float, Field(gt=0)]], Field(min_length=1)]
     """Unit name -> units per raw step. The first is the default."""
     zero: int = 0
     """The raw value at position 0."""

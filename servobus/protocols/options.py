@@ -11,8 +11,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from servobus.protocols.base import Calibration
 from servobus.protocols.model import Data, Pair, ServoModel
+from servobus.protocols.words import Calibration
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 StopKind = Literal["hold", "limp", "park"]
@@ -61,27 +61,41 @@ class ServoOptions(Data):
 
     id: int
     model: str = ""
-    zero: Finite | None = None
+    zero: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
+    """Raw steps where the joint is at 0; the model's own if omitted."""
     direction: Literal[1, -1] = 1
-    gear: Positive = 1.0
+    """-1: mounted the other way round."""
+    gear: Annotated[float, Field(ge=0.001, le=1000)] = 1.0
     """Turns of the servo for one turn of the joint."""
     limits: Pair[Finite] | None = None
+    """Least and greatest position a goal may have."""
     on_limit: Literal["reject", "clamp"] = "reject"
+    """What happens to a goal outside a limit: it is refused, or the nearest inside is sent and said so."""
     speed: Positive | None = None
+    """Unit/s of goals that name none; max_speed if omitted."""
     max_speed: Positive | None = None
+    """Unit/s."""
     max_step: Positive | None = None
     """Greatest distance from the last setpoint that one goal may ask for."""
     acceleration: Positive | None = None
+    """Unit/s^2."""
     torque_limit: Annotated[float, Field(gt=0, le=100)] | None = None
     """Percent."""
     ttl: Positive | None = None
+    """Seconds that a goal may wait for its first byte to leave; later it is dropped."""
     on_estop: StopKind = "hold"
+    """What an e-stop does: hold stays where it is, limp switches torque off, park goes to park_pose and then limp."""
     on_exit: StopKind = "hold"
+    """The same, when servobus ends."""
     on_lost_client: StopKind = "hold"
+    """The same, when the program that moves the servo is gone."""
     park_pose: Finite | None = None
     park_timeout: Positive = 5.0
+    """Seconds on the way to park_pose; then limp, wherever it is."""
     unit: str | None = None
+    """Of positions and speeds: one of the model's units, the first of them if omitted."""
     allow_max_speed: bool = False
+    """Let a goal's speed be 0, which servos take as no limit."""
 
     @property
     def key(self) -> Hashable:
@@ -112,7 +126,9 @@ class PollRates(Data):
     """Reads on a fixed grid, in Hz; omit for none."""
 
     feedback: Rate | None = None
+    """What control needs: position, speed, load and what stands beside them."""
     health: Rate | None = None
+    """Everything that is known of a servo."""
 
     def rates(self) -> dict[str, float]:
         return {name: hz for name, hz in (("feedback", self.feedback), ("health", self.health)) if hz}
@@ -122,16 +138,21 @@ class BusOptions(Data):
     """One bus of any protocol. `protocol` and `servos` are narrowed by each."""
 
     protocol: str
-    port: Annotated[str, Field(min_length=1)]
+    port: Annotated[str, Field(min_length=1, max_length=255)]
+    """Device path, tcp://HOST:PORT, or sim: for simulated servos. Best a /dev/serial/by-id name, which belongs to the adapter."""
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)]
+    """Bits/s that the servos are set to."""
     poll: PollRates = PollRates()
     goal_rate: Rate | None = None
     """Hz that `check` counts goals with; the feedback rate if omitted."""
     echo: Literal["off", "on", "auto"] = "off"
+    """Whether the adapter hears what it says; auto finds out by asking an id that nobody has."""
     rs485: bool = False
+    """Let the driver of the port switch the transmitter; USB adapters do it by themselves."""
     timeout_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
     """Greatest deadline of a turn beyond its wire time; 100 ms if omitted."""
     faults: FaultOptions | None = None
+    """For simulated lines: how bad the line is."""
     servos: Mapping[Name, ServoOptions] = {}
 
     @model_validator(mode="after")
@@ -139,6 +160,11 @@ class BusOptions(Data):
         if self.faults is not None and not self.port.startswith("sim:"):
             raise ValueError('faults are for a simulated line: set port to "sim:" or take faults out')
         return self
+
+    @property
+    def spread(self) -> float | None:
+        """On four wires: seconds by which the pauses before two servos' answers may differ. None: half duplex."""
+        return None
 
     @property
     def rate_of_goals(self) -> float:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from servobus.protocols import sms
+from servobus.protocols import kst, sms
 from servobus.protocols.entry import ProtocolEntry
 
 PROTOCOLS: dict[str, ProtocolEntry] = {
     "sms": sms.ENTRY,
+    "kst": kst.ENTRY,
 }

@@ -38,7 +38,14 @@ def simulated_line(
     """The servos of a bus, each standing at its zero."""
     entry = PROTOCOLS[options.protocol]
     devices = entry.devices(options, models)
-    return SimLine(devices, entry.device_codec(), loop, baudrate=options.baudrate, wire_time=wire_time)
+    return SimLine(
+        devices,
+        entry.device_codec(options),
+        loop,
+        baudrate=options.baudrate,
+        wire_time=wire_time,
+        four_wires=options.spread is not None,
+    )
 
 
 def far_end(options: BusOptions, line: SimLine, loop: asyncio.AbstractEventLoop) -> FarEnd:

@@ -42,6 +42,7 @@ class SimLine:
         *,
         baudrate: int,
         wire_time: bool = True,
+        four_wires: bool = False,
     ) -> None:
         self.devices = list(devices)
         self.collisions = 0
@@ -51,6 +52,8 @@ class SimLine:
         self._now = clock_of(loop)
         self.baudrate = baudrate
         self._byte_time = 10.0 / baudrate
+        self._four_wires = four_wires
+        """Questions and answers do not meet; two answers still do."""
         self._deliver: Callable[[bytes], None] = _nobody
         self._said_until = 0.0
         """When the master will have said all it was given to say."""
@@ -158,7 +161,7 @@ class SimLine:
 
     def _clash(self, master: Saying) -> bool:
         """Whether the master speaks over replies: they are garbled, and so is what the devices hear of it."""
-        met = [saying for saying in self._sayings if self._meet(saying, master)]
+        met = [saying for saying in self._sayings if not self._four_wires and self._meet(saying, master)]
         for saying in met:
             shift = round((saying.begin - master.begin) / self._byte_time)
             master.data, saying.data = over(master.data, saying.data, shift), over(saying.data, master.data, -shift)

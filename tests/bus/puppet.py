@@ -78,7 +78,7 @@ async def puppet_bus(
     options, models = setup.buses["arm"], setup.models["arm"]
     puppet, events, entry = Puppet(), Events(), PROTOCOLS["sms"]
     link = MemoryLink(puppet, traits or LineTraits(can_change_baud=True))
-    bus = BusService("arm", options, entry.driver(options, models), entry.codec(), link.traits, events)
+    bus = BusService("arm", options, entry.driver(options, models), entry.codec(options), link.traits, events)
     await link.connect(bus.master)
     if started:
         await bus.start()

@@ -6,7 +6,7 @@ from typing import Any
 
 from servobus.bus.coalescer import Coalescer, Group, Ticket
 from servobus.errors import ActionWithheld, GoalExpired, NotEnabled, ServobusError
-from servobus.protocols.base import Outcome
+from servobus.protocols.words import Outcome
 from tests.bus.toy import ticket
 
 Ended = list[tuple[str, Any]]

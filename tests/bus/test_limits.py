@@ -10,8 +10,8 @@ import pytest
 
 from servobus.bus.limits import check_goal
 from servobus.errors import LimitError
-from servobus.protocols.base import Goal
 from servobus.protocols.options import ServoOptions
+from servobus.protocols.words import Goal
 
 PLAIN = ServoOptions(id=1)
 NEXT = 1e-9

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import pytest
 
 from servobus.errors import DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
-from servobus.protocols.base import Goal, Outcome
 from servobus.protocols.sms.codec import Instruction, encode
+from servobus.protocols.words import Goal, Outcome
 from tests.bus.puppet import Answers, puppet_bus
 from tests.virtual import virtual
 

@@ -6,8 +6,8 @@ import pytest
 
 from servobus.bus.health import Health
 from servobus.bus.record import ServoRecord
-from servobus.protocols.base import State
 from servobus.protocols.options import ServoOptions
+from servobus.protocols.words import State
 
 
 @pytest.fixture

@@ -21,7 +21,8 @@ from servobus.errors import (
     ReplyTimeout,
     ServobusError,
 )
-from servobus.protocols.base import Outcome, Plan, run_plan
+from servobus.protocols.base import Plan, run_plan
+from servobus.protocols.words import Outcome
 from tests.bus.toy import ANSWER, READ, Bench, Sink, poll, read, ticket
 
 Ended = list[tuple[str, Any]]

@@ -14,7 +14,8 @@ from servobus.bus.coalescer import Coalescer, Ticket
 from servobus.bus.health import Condition, Health, Node
 from servobus.bus.scheduler import QUEUE_LIMIT, Scheduler
 from servobus.errors import DeviceError
-from servobus.protocols.base import Driver, Goal, GoalTurn, Outcome, Plan, Poll, Request, ServoGoal
+from servobus.protocols.base import Driver, GoalTurn, Plan, Poll, Request
+from servobus.protocols.words import Goal, Outcome, ServoGoal
 
 READ, PING, WRITE, ANSWER = 1, 2, 3, 0x80
 ALL = 0xFF
@@ -185,12 +186,15 @@ class Bench:
         self.changes: list[tuple[int, Condition, Condition]] = []
         self.updates: list[Any] = []
         self.restarts: list[int] = []
+        self.cuts: list[tuple[str, Exception]] = []
         self.health = Health(nodes or (1, 2, 3), changed=self._changed)
         self.scheduler = Scheduler(
             cast("Driver", self.driver),
             self.health,
             on_update=self.updates.append,
             on_restart=lambda node: self.restarts.append(node.id),
+            on_cut=lambda servo, error: self.cuts.append((servo, error)),
+            cycle=10.0,
             limit=limit,
         )
         if online:

@@ -104,7 +104,7 @@ def service(nodes: int, faults: FaultOptions | None = None, *, echo: str = "off"
     far = oracle if faults is None else FaultyEnd(oracle, faults, loop, rename=_neighbour, node_of=node_of)
     link = MemoryLink(far, LineTraits())
     entry = PROTOCOLS[options.protocol]
-    bus = BusService("arm", options, entry.driver(options, models), entry.codec(), link.traits, _event)
+    bus = BusService("arm", options, entry.driver(options, models), entry.codec(options), link.traits, _event)
     return bus, link, oracle
 
 

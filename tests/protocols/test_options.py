@@ -24,7 +24,9 @@ BUS = {"protocol": "sms", "port": "sim:", "baudrate": 115200}
         ({"on_exit": "park", "park_pose": 10.1, "limits": [0, 10]}, "park_pose 10.1 is outside limits"),
         ({"speed": 10.1, "max_speed": 10}, "speed 10.1 is above max_speed 10"),
         ({"speed": 0}, "greater than 0"),
-        ({"gear": 0}, "greater than 0"),
+        ({"gear": 0.0009}, "greater than or equal to 0.001"),
+        ({"gear": 1000.1}, "less than or equal to 1000"),
+        ({"zero": 1.1e9}, "less than or equal to 1000000000"),
         ({"direction": 2}, "Input should be 1 or -1"),
         ({"torque_limit": 100.1}, "less than or equal to 100"),
         ({"torque_limit": 0}, "greater than 0"),
@@ -48,6 +50,8 @@ def test_what_does_not_fit(keys: dict[str, Any], told: str) -> None:
         {"speed": 10, "max_speed": 10},
         {"torque_limit": 100},
         {"direction": -1, "gear": 2.5},
+        {"gear": 0.001, "zero": -1e9},
+        {"gear": 1000, "zero": 1e9},
     ],
 )
 def test_what_fits_at_its_edge(keys: dict[str, Any]) -> None:
@@ -86,6 +90,15 @@ def test_baud_rates_at_their_edges(rate: int, right: bool) -> None:
     else:
         with pytest.raises(ValidationError, match="baudrate"):
             BusOptions.model_validate({**BUS, "baudrate": rate})
+
+
+@pytest.mark.parametrize(("length", "right"), [(0, False), (1, True), (255, True), (256, False)])
+def test_lengths_of_ports_at_their_edges(length: int, right: bool) -> None:
+    if right:
+        assert BusOptions.model_validate({**BUS, "port": "/" * length}).port
+    else:
+        with pytest.raises(ValidationError, match="port"):
+            BusOptions.model_validate({**BUS, "port": "/" * length})
 
 
 def test_rates() -> None:

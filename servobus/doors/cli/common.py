@@ -28,8 +28,8 @@ from servobus.doors.cli.tracing import Tracer
 from servobus.doors.cli.voice import Voice
 from servobus.errors import ConfigError, DeviceError
 from servobus.local import LocalRig, Trace, open_rig
-from servobus.protocols.base import State
 from servobus.protocols.table import PROTOCOLS
+from servobus.protocols.words import State
 from servobus.rig import full_name
 
 R = TypeVar("R")
@@ -113,7 +113,7 @@ async def traced(config: Config, options: Options) -> AsyncIterator[Trace | None
     if not (options.trace or options.dry_run):
         yield None
         return
-    codecs = {name: PROTOCOLS[bus.protocol].codec() for name, bus in config.buses.items()}
+    codecs = {name: PROTOCOLS[bus.protocol].codec(bus) for name, bus in config.buses.items()}
     voice = Voice(sys.stderr if options.trace or options.as_json else sys.stdout)
     tracer = Tracer(codecs, voice.say, heard=options.trace)
     try:
@@ -169,7 +169,7 @@ def logs(level: int = logging.WARNING) -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer(colors="NO_COLOR" not in os.environ)
+            structlog.dev.ConsoleRenderer(colors=not os.environ.get("NO_COLOR"))
             if terminal
             else structlog.processors.JSONRenderer(),
         ],

@@ -16,7 +16,7 @@ from servobus.doors.cli.common import Number, echo_table, emit, logs, run
 from servobus.doors.cli.offline import loads_of
 from servobus.errors import ServobusError
 from servobus.local import LocalRig, open_rig
-from servobus.protocols.base import Outcome
+from servobus.protocols.words import Outcome
 from servobus.rig import Servo
 
 GOAL_HZ = 100.0

@@ -12,8 +12,8 @@ from servobus.bus.limits import check_goal
 from servobus.config import Config
 from servobus.doors.cli.common import Number, Options, echo_table, emit, logs, opened, run, servo_options
 from servobus.errors import LimitError, NotSupported, ServobusError
-from servobus.protocols.base import Goal, ServoGoal
 from servobus.protocols.table import PROTOCOLS
+from servobus.protocols.words import Goal, ServoGoal
 from servobus.rig import full_name
 
 NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"

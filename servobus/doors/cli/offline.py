@@ -108,7 +108,7 @@ def decode(hex_bytes: tuple[str, ...], protocol: str, only: str | None, as_json:
     if protocol not in PROTOCOLS:
         raise UnknownName(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
     entry, data = PROTOCOLS[protocol], _bytes_of(" ".join(hex_bytes))
-    codecs = {"request": entry.device_codec(), "reply": entry.codec()}
+    codecs = {"request": entry.device_codec(None), "reply": entry.codec(None)}
     words = {kind: _in_words(codec, data, kind) for kind, codec in codecs.items() if only in (None, kind)}
     if as_json:
         emit({"frame": data.hex(" "), **words})

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
 
 import click
 
+from servobus.config import Config
 from servobus.doors.cli.common import STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, show, state_row
 from servobus.errors import ServobusError
 from servobus.local import LocalRig
+from servobus.protocols.table import PROTOCOLS
+from servobus.rig import full_name
 
 
 @click.command()
@@ -107,14 +110,14 @@ async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) 
 @click.option("--persist", is_flag=True, help="Allow EEPROM registers: they are unlocked, written, read back and locked again.")
 @servo_options
 def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, persist: bool) -> int:
-    """Write registers of one servo, and read back what they hold then.
+    """Write registers of one servo, and read back what they hold then. All are checked before the first is written.
 
     Goals, torque and lock are not written by hand: use move, enable and disable.
 
     Example: servobus write elbow torque_limit=60
     """
     logs()
-    wanted = dict(_assignment(text) for text in assignments)
+    wanted = _wanted(options.setup, name, assignments, raw=raw, persist=persist)
 
     async def main() -> int:
         async with opened(options, [name]) as rig:
@@ -131,6 +134,23 @@ def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, 
             return 0
 
     return run(main)
+
+
+def _wanted(config: Config, name: str, assignments: Iterable[str], *, raw: bool, persist: bool) -> dict[str, Any]:
+    """Register -> value. All are checked before the first is written: LimitError, UnknownName, NotSupported."""
+    bus, servo = config.names[full_name(config.names, name)]
+    options = config.buses[bus]
+    driver = PROTOCOLS[options.protocol].driver(options, config.models[bus])
+    wanted: dict[str, Any] = {}
+    for register, value in map(_assignment, assignments):
+        if register in wanted:
+            raise click.BadParameter(f"{register} is named twice: give each register one value", param_hint="REGISTER=VALUE")
+        wanted[register] = value
+        try:
+            driver.write_register(servo, register, value, raw=raw, persist=persist).close()
+        except ServobusError as error:
+            raise error.at(bus=bus, servo=servo) from None
+    return wanted
 
 
 def _assignment(text: str) -> tuple[str, Any]:

@@ -7,12 +7,18 @@ from servobus.protocols.sms.driver import SmsDriver
 from servobus.protocols.sms.load import load_models
 from servobus.protocols.sms.options import SmsBus
 
+
+def codec(options: SmsBus | None) -> SmsCodec:
+    """The same for every bus, and at both ends."""
+    return SmsCodec()
+
+
 ENTRY = ProtocolEntry(
     options=SmsBus,
     models=load_models,
-    codec=SmsCodec,
+    codec=codec,
     driver=SmsDriver,
-    device_codec=SmsCodec,
+    device_codec=codec,
     devices=devices,
     rename=rename,
     node_of=node_of,

@@ -8,18 +8,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError, UnknownName
-from servobus.protocols.base import (
-    GoalTurn,
-    Identity,
-    Plan,
-    Poll,
-    Request,
-    ServoGoal,
-    StopReport,
-    StopTarget,
-    Update,
-    ask,
-)
+from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
@@ -29,6 +18,7 @@ from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Fence, Ping, Read, SyncRead, Write
 from servobus.protocols.sms.servo import FittedServo
 from servobus.protocols.sms.stop import Stopper
+from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
 
 FENCE_SIZES = range(3, 27)
 """Never two parameters: the echo of any READ has two."""
@@ -270,6 +260,10 @@ class SmsDriver:
         start = goal if goal.start is not None else ServoGoal(goal.servo, goal.goal, goal.goal.value)
         self.servos[goal.servo].goal_span(start)
 
+    def pace(self, goal: ServoGoal) -> float | None:
+        """The servo keeps the speed that stands beside its goal."""
+        return None
+
     def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
         return self._writer.plan([(self.servos[goal.servo], goal) for goal in goals], together=together, confirm=confirm)
 
@@ -278,7 +272,7 @@ class SmsDriver:
 
 
 def fence_size(avoid: Sequence[Hashable]) -> int:
-    """A READ length that no reply still under way can have; when all are taken, the one asked longest ago, so `avoid` is by age."""
+    """A READ length that no reply still under way can have; when all are taken, the oldest (`avoid` is oldest first)."""
     free = (size for size in FENCE_SIZES if size not in avoid)
     oldest = (key for key in avoid if isinstance(key, int) and key in FENCE_SIZES)
     return next(free, None) or next(oldest)

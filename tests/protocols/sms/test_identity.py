@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from servobus.protocols.base import Identity
 from servobus.protocols.sms.codec import Instruction
+from servobus.protocols.words import Identity
 from tests.protocols.sms.bench import Bench
 
 

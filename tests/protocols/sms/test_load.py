@@ -1,86 +1,14 @@
-"""Model files: the packaged ones hold what the vendor's memory tables say, and own ones extend them."""
+"""Model files: found by name or beside the config, extended, and every mistake told at its place."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from servobus.errors import ConfigError
-from servobus.protocols.sms.load import find_model, merged, packaged_models, read_model
-
-Fact = tuple[int, int, int | None, str]
-"""Address, bytes, sign bit, memory."""
-MAGNETIC: dict[str, Fact] = {
-    "id": (5, 1, None, "eeprom"),
-    "baud_rate": (6, 1, None, "eeprom"),
-    "return_delay": (7, 1, None, "eeprom"),
-    "response_status_level": (8, 1, None, "eeprom"),
-    "min_angle_limit": (9, 2, None, "eeprom"),
-    "max_angle_limit": (11, 2, None, "eeprom"),
-    "max_temperature": (13, 1, None, "eeprom"),
-    "max_torque": (16, 2, None, "eeprom"),
-    "torque_enable": (40, 1, None, "ram"),
-    "acceleration": (41, 1, None, "ram"),
-    "goal_position": (42, 2, 15, "ram"),
-    "goal_speed": (46, 2, 15, "ram"),
-    "present_position": (56, 2, 15, "ram"),
-    "present_speed": (58, 2, 15, "ram"),
-    "present_load": (60, 2, 10, "ram"),
-    "present_voltage": (62, 1, None, "ram"),
-    "present_temperature": (63, 1, None, "ram"),
-    "async_write_flag": (64, 1, None, "ram"),
-    "moving": (66, 1, None, "ram"),
-    "present_current": (69, 2, None, "ram"),
-}
-FACTS: dict[str, dict[str, Fact]] = {
-    "sms": {**MAGNETIC, "lock": (55, 1, None, "ram"), "position_offset": (31, 2, 11, "eeprom"), "mode": (33, 1, None, "eeprom")},
-    "sts": {**MAGNETIC, "lock": (55, 1, None, "ram"), "position_offset": (31, 2, 11, "eeprom"), "mode": (33, 1, None, "eeprom")},
-    "sms_cl": {
-        **{name: fact for name, fact in MAGNETIC.items() if name not in ("present_current",)},
-        "lock": (48, 1, None, "ram"),
-        "mode": (35, 1, None, "eeprom"),
-    },
-    "scs": {
-        "id": (5, 1, None, "eeprom"),
-        "min_angle_limit": (9, 2, None, "eeprom"),
-        "max_angle_limit": (11, 2, None, "eeprom"),
-        "torque_enable": (40, 1, None, "ram"),
-        "goal_position": (42, 2, None, "ram"),
-        "goal_time": (44, 2, None, "ram"),
-        "lock": (48, 1, None, "ram"),
-        "present_position": (56, 2, None, "ram"),
-        "moving": (66, 1, None, "ram"),
-    },
-}
-CASES = [(model, name, fact) for model, facts in FACTS.items() for name, fact in facts.items()]
-
-
-@pytest.mark.parametrize(("model", "name", "fact"), CASES, ids=[f"{model}-{name}" for model, name, _ in CASES])
-def test_registers_stand_where_the_tables_say(model: str, name: str, fact: Fact) -> None:
-    register = packaged_models()[model].registers[name]
-    assert (register.address, register.size, register.sign_bit, register.memory) == fact
-
-
-@pytest.mark.parametrize(
-    ("model", "order", "middle", "sync_read", "wheel"),
-    [
-        ("sms", "little", 2048, False, {"mode": 1}),
-        ("sts", "little", 2048, True, {"mode": 1}),
-        ("sms_cl", "little", 2048, False, {"mode": 1}),
-        ("scs", "big", 512, False, {"min_angle_limit": 0, "max_angle_limit": 0}),
-    ],
-)
-def test_what_differs_between_the_families(model: str, order: str, middle: int, sync_read: bool, wheel: dict[str, int]) -> None:
-    found = packaged_models()[model]
-    assert (found.byte_order, found.zero, found.sync_read) == (order, middle, sync_read)
-    assert found.wheel is not None
-    assert found.wheel.registers == wheel
-    assert found.default_speed == 1000
-
-
-def test_all_four_are_packaged() -> None:
-    assert set(packaged_models()) == {"sms", "sms_cl", "sts", "scs"}
+from servobus.protocols.sms.load import FOLDER, find_model, merged, packaged_models, read_model
 
 
 def test_names_and_files(tmp_path: Path) -> None:
@@ -103,9 +31,23 @@ def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("extends: none\nname: x\n", ":1:10: extends: is none of scs, sms, sms_cl, sts"),
+        ("extends: none\nname: x\n", ":1:10: extends: found 'none'; there are scs, sms, sms_cl, sts"),
         ("extends: sts\nregisters: {lock: {adress: 5}}\n", "did you mean address?"),
         ("extends: sts\nregisters: {lock: {address: -1}}\n", ":2:29: registers.lock.address: found -1"),
+        ("extends: sts\nregisters: {lock: {address: 256}}\n", ":2:13: registers.lock: found 1 bytes at address 256"),
+        ("extends: sts\nregisters: {lock: {size: 2, address: 255}}\n", "found 2 bytes at address 255; the last address is 255"),
+        ("extends: sts\nregisters: {lock: {sign_bit: 8}}\n", "found sign_bit 8; its 1 bytes have bits 0 to 7"),
+        ("extends: sts\nregisters: {lock: {maximum: 256}}\n", "registers.lock: found values 0 to 256; it can hold 0 to 255"),
+        ("extends: sts\nregisters: {lock: {minimum: 2}}\n", "registers.lock: found values 2 to 1"),
+        ("extends: sts\nregisters: {lock: {default: 256}}\n", "registers.lock: found default 256; it can hold 0 to 255"),
+        ("extends: sts\nstate: {positon: lock}\n", ":2:9: state.positon: found 'positon'; expected 'position', 'goal'"),
+        ("extends: sts\nfeedback: [moving, present_position]\n", "moving stands behind present_position"),
+        ("extends: sts\ngoal: [goal_position]\n", ":2:7: goal: found 1 here; write 3 or more"),
+        ("extends: sts\ngoal: [a, b, c, d]\n", ":2:7: goal: found 4 here; write at most 3"),
+        ("extends: sts\nwheel: {registers: {modus: 1}}\n", "modus is named as a part, but is no register of the map"),
+        ("extends: sts\nstate: 7\n", ":2:8: state: found no keys here; write `{key: value}`"),
+        ("extends: [sts]\n", ":1:10: extends: found ['sts']; there are"),
+        ("", "found no keys here; there are name, title"),
         ("extends: sts\ngoal: [goal_position, goal_speed, goal_time]\n", "do not stand one behind the other"),
         ("extends: sts\ntorque: power\n", "power is named as a part, but is no register of the map"),
         ("name: x\n", "the key title is missing"),
@@ -117,6 +59,42 @@ def test_mistakes_in_a_model_file(text: str, told: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         read_model(path)
     assert told in str(caught.value)
+
+
+def without(path: Path, pattern: str, instead: str) -> None:
+    """A whole model file of its own with something changed that extending could not take away."""
+    text, count = re.subn(pattern, instead, (FOLDER / "sts.yaml").read_text(), count=1, flags=re.MULTILINE)
+    assert count == 1
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "instead", "told"),
+    [
+        (r"^units: .*$", "units: {}", "units: found 0 here; write 1 or more"),
+        (r"^  position: present_position$", "", "state: position must be there"),
+        (r"^  response_status_level: .*$", "", "registers: response_status_level must be there"),
+    ],
+)
+def test_what_every_model_needs(pattern: str, instead: str, told: str, tmp_path: Path) -> None:
+    without(tmp_path / "mine.yaml", pattern, instead)
+    with pytest.raises(ConfigError, match=told):
+        read_model(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "lock: {address: 255}",
+        "lock: {size: 2, address: 254}",
+        "lock: {sign_bit: 7, minimum: -127, maximum: 127}",
+        "lock: {maximum: 255, default: 255}",
+        "lock: {minimum: 1}",
+    ],
+)
+def test_what_a_register_can_just_hold(change: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(f"extends: sts\nregisters: {{{change}}}\n")
+    assert read_model(tmp_path / "mine.yaml").registers["lock"]
 
 
 def test_merging() -> None:

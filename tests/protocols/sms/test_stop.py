@@ -6,8 +6,8 @@ from typing import Literal
 
 import pytest
 
-from servobus.protocols.base import Goal, StopReport, StopTarget
 from servobus.protocols.sms.codec import Instruction
+from servobus.protocols.words import Goal, StopReport, StopTarget
 from tests.protocols.sms.bench import TWO, Bench, meddle
 
 
