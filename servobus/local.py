@@ -76,7 +76,7 @@ class LocalRig(Rig):
 
     def bus_of(self, name: str) -> tuple[BusService, str]:
         """The bus and the bare name of a servo, by full or unique bare name. Raises UnknownName."""
-        bus, servo = self._names[self.full_name(name)]
+        bus, servo = self._names.get(name) or self._names[self.full_name(name)]
         return self.buses[bus], servo
 
     # Lines

@@ -145,7 +145,8 @@ class Health:
         self._greatest_deadline = greatest_deadline
         self._changed = changed
         self.nodes: dict[int, Node] = {}
-        self._troubled: dict[int, Node] = {}
+        self.troubled: dict[int, Node] = {}
+        """Configured nodes that are not online."""
         for node_id in nodes:
             self._add(node_id, configured=True)
 
@@ -181,14 +182,14 @@ class Health:
 
     def due_probe(self, now: float) -> Node | None:
         """The configured node that has waited longest to be looked for."""
-        if not self._troubled:
+        if not self.troubled:
             return None
-        due = [node for node in self._troubled.values() if node.next_probe <= now]
+        due = [node for node in self.troubled.values() if node.next_probe <= now]
         return min(due, key=lambda node: node.next_probe, default=None)
 
     def next_probe(self) -> float | None:
         """When the next probe is due; None: no node needs one."""
-        return min((node.next_probe for node in self._troubled.values()), default=None)
+        return min((node.next_probe for node in self.troubled.values()), default=None)
 
     def _add(self, node_id: int, *, configured: bool) -> Node:
         node = Node(node_id, configured=configured, greatest_deadline=self._greatest_deadline)
@@ -196,7 +197,7 @@ class Health:
             # Nothing was asked of it yet, so nothing of it can be under way.
             node.condition = Condition.ONLINE
         else:
-            self._troubled[node_id] = node
+            self.troubled[node_id] = node
         self.nodes[node_id] = node
         return node
 
@@ -204,7 +205,7 @@ class Health:
         if node.condition is before:
             return
         if node.condition is Condition.ONLINE:
-            self._troubled.pop(node.id, None)
+            self.troubled.pop(node.id, None)
         elif node.configured:
-            self._troubled[node.id] = node
+            self.troubled[node.id] = node
         self._changed(node, before)

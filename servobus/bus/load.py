@@ -82,12 +82,15 @@ def _goal_requests(options: BusOptions, driver: Driver) -> list[Request[Any]]:
 
 
 def _stop_requests(driver: Driver) -> list[Request[Any]]:
-    """What an e-stop says before it asks anything."""
+    """What an e-stop says before it waits for an answer; where nothing can be said to all at once, a turn for each node."""
     targets = [StopTarget(name, "hold", enabled=True, position=0.0) for name in driver.nodes]
     requests: list[Request[Any]] = []
-    if targets:
-        run_plan(driver.stop(targets), lambda request: requests.append(request) or 0)  # type: ignore[func-returns-value]
-    return [request for request in requests if not request.replies]
+    plan = driver.stop(targets) if targets else iter(())
+    for request in plan:  # each step is told that its request brought nothing
+        if request.replies:
+            return requests or [request] * len(set(driver.nodes.values()))
+        requests.append(request)
+    return requests
 
 
 def _somewhere(servo: ServoOptions) -> float:

@@ -39,6 +39,9 @@ class Profile:
         self._sent: dict[str, float] = {}
         """The last setpoint of each servo that was ever led: where it stands, or is on its way to."""
 
+    def __len__(self) -> int:
+        return len(self._ramps)
+
     def begin(self, ticket: Ticket, speed: float, now: float) -> None:
         """Lead this goal's servo at `speed` (unit/s), instead of to any goal before. The ticket becomes the first setpoint's.
         A goal whose start nobody knows is sent as it is."""

@@ -11,15 +11,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from servobus.bus.coalescer import Coalescer, Group, Ticket
+from servobus.bus.grid import PollGrid
 from servobus.bus.health import Condition, Health, Node
 from servobus.bus.profile import Profile
 from servobus.bus.queue import Callback, Job, RequestQueue, overloaded
 from servobus.errors import ReplyTimeout, ServobusError
-from servobus.protocols.base import Driver, GoalTurn, Plan, Poll
+from servobus.protocols.base import Driver, GoalTurn, Plan
 from servobus.protocols.words import Outcome
 
 QUEUE_LIMIT = 1024
@@ -28,23 +28,6 @@ POLL_PATIENCE = 1.0
 """Seconds after which a poll that could not be sent is not wanted any more."""
 
 OFFLINE = "it is offline: is it powered, are id and baud rate right? It is probed, and served again as soon as it answers"
-
-
-@dataclass(slots=True)
-class PollTimer:
-    """A poll on a fixed grid: `due` moves by whole periods, so a late poll does not shift the next one."""
-
-    poll: Poll
-    due: float
-    missed: int = 0
-
-    def advance(self, now: float) -> None:
-        period = 1.0 / self.poll.hz
-        self.due += period
-        if self.due <= now:
-            behind = int((now - self.due) / period) + 1
-            self.missed += behind
-            self.due += behind * period
 
 
 class Scheduler:
@@ -75,9 +58,7 @@ class Scheduler:
         self._on_update = on_update
         self._on_restart = on_restart
         self._goal_jobs: deque[tuple[Job, list[Ticket]]] = deque()
-        self._polls: list[PollTimer] = []
-        self._poll_due = math.inf
-        self._missed_before = 0
+        self.polls = PollGrid()
         self._parked: list[Job] = []
         self._parked_until = math.inf
         """When the first of those set aside has waited long enough."""
@@ -102,17 +83,6 @@ class Scheduler:
         """It failed and may be said again: it stays the first of its node, and the other nodes have their turns before it."""
         self.requests.put_back(job)
 
-    def set_polls(self, polls: Sequence[Poll], now: float) -> None:
-        """Polls of one rate are spread over their period."""
-        self._missed_before = self.missed_polls
-        self._polls = [PollTimer(poll, now + index / len(polls) / poll.hz) for index, poll in enumerate(polls)]
-        self._poll_due = min((timer.due for timer in self._polls), default=math.inf)
-
-    @property
-    def missed_polls(self) -> int:
-        """Grid points that passed without their poll, since the beginning."""
-        return self._missed_before + sum(timer.missed for timer in self._polls)
-
     def waiting(self) -> int:
         """Everything that waits, for people."""
         return len(self.requests) + len(self.coalescer) + len(self._parked) + len(self.estop) + len(self._goal_jobs)
@@ -127,6 +97,9 @@ class Scheduler:
             return self.estop.popleft()
         if self.session is not None:
             return self.requests.take(now, self.session)
+        if self._only_requests(now):  # nearly always, where callers ask as fast as they can
+            job = self.requests.take(now)
+            return None if job is None else self._served(1, job)
         for lane, take in enumerate(self._lanes):
             if not self._owed[lane] and (job := take(now)) is not None:
                 return self._served(lane, job)
@@ -137,6 +110,17 @@ class Scheduler:
         self._owed = [False] * len(self._lanes)  # nobody waits, so nobody is owed anything
         return None
 
+    def _only_requests(self, now: float) -> bool:
+        """No other class has anything to say."""
+        return not (
+            len(self.requests) == 0
+            or self._goal_jobs
+            or len(self.coalescer)
+            or len(self.profile)
+            or self.polls.due <= now
+            or self.health.troubled
+        )
+
     def _served(self, lane: int, job: Job) -> Job:
         """Every class above has had its lower turn; this one owes one now."""
         for above in range(lane):
@@ -146,12 +130,11 @@ class Scheduler:
 
     def wake(self) -> float | None:
         """The next moment at which something becomes due or too old, if nothing else happens."""
-        times = [self.requests.next_expiry(), self.coalescer.next_expiry()]
-        times.append(self._parked_until if self._parked else None)
+        times = [self._parked_until, self.requests.next_expiry(), self.coalescer.next_expiry()]
         if self.session is None:
-            times += (self.health.next_probe(), self.profile.next_due())
-            times.append(self._poll_due if self._polls else None)
-        return min((time for time in times if time is not None), default=None)
+            times += (self.polls.due, self.health.next_probe(), self.profile.next_due())
+        soonest = min(time for time in times if time is not None)
+        return None if soonest == math.inf else soonest
 
     def expire(self, now: float) -> None:
         """End what is too old. Called when nothing can be sent, or nothing is due."""
@@ -261,11 +244,8 @@ class Scheduler:
         return self.requests.take(now)
 
     def _next_poll(self, now: float) -> Job | None:
-        while self._poll_due <= now:
-            timer = min(self._polls, key=lambda timer: timer.due)
-            timer.advance(now)
-            self._poll_due = min(timer.due for timer in self._polls)
-            request = timer.poll.request(self.health.reachable())
+        while (poll := self.polls.take(now)) is not None:
+            request = poll.request(self.health.reachable())
             if request is not None:
                 return Job(Callback(self._on_update), now + POLL_PATIENCE, request=request, tries=1)
         return None

@@ -79,7 +79,7 @@ class BusService:
             await self._probe_echo()
         await asyncio.gather(*(self._introduce(record) for record in self.records.values()))
         if self.master.up:
-            self.scheduler.set_polls(self.driver.polls(self.options.poll.rates()), self.clock())
+            self.scheduler.polls.set(self.driver.polls(self.options.poll.rates()), self.clock())
             self.master.goals_waiting()
 
     async def _probe_echo(self) -> None:
@@ -177,7 +177,7 @@ class BusService:
         counts = self.stats.counts
         counts["drains"] = self.line.drains
         counts["collisions"] = self.line.echo.collisions if self.line.echo else 0
-        counts["polls_missed"] = self.scheduler.missed_polls
+        counts["polls_missed"] = self.scheduler.polls.missed
         counts["goal_groups_split"] = self.scheduler.split_groups
         counts["goal_turns"] = self.scheduler.goal_turns
         nodes = {

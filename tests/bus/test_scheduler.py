@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
+from servobus.bus.grid import PollTimer
 from servobus.bus.health import FIRST_DEADLINE, GREATEST_BACKOFF
 from servobus.bus.queue import Job
-from servobus.bus.scheduler import POLL_PATIENCE, PollTimer
+from servobus.bus.scheduler import POLL_PATIENCE
 from servobus.errors import (
     ActionWithheld,
     EStopped,
@@ -79,7 +80,7 @@ class Flood:
         self.now = 0.0
         self._ended: Ended = []
         if "poll" in classes:
-            self.bench.scheduler.set_polls([poll("feedback", 1000, 1, 2)], 0.0)
+            self.bench.scheduler.polls.set([poll("feedback", 1000, 1, 2)], 0.0)
         if "probe" in classes:
             self.bench.health.missed(self.bench.node(3), READ, 0.0, 0.0)
 
@@ -101,7 +102,7 @@ class Flood:
 def test_the_classes_go_in_their_order() -> None:
     bench, ended = Bench(1, 2, 3), Ended()
     bench.health.missed(bench.node(3), READ, 0.0, 0.0)
-    bench.scheduler.set_polls([poll("feedback", 50, 1)], 0.0)
+    bench.scheduler.polls.set([poll("feedback", 50, 1)], 0.0)
     bench.scheduler.submit(job(2), 0.0)
     bench.coalescer.put(ticket(1, ended))
     bench.scheduler.estop.append(stop_job())
@@ -175,7 +176,7 @@ def test_a_grid_point_that_is_now_belongs_to_this_poll() -> None:
 
 def test_polls_of_one_rate_are_spread_over_their_period() -> None:
     bench = Bench(1, 2)
-    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
+    bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
     assert bench.scheduler.wake() == 5.0
     assert kind(bench.scheduler.next_turn(5.0)) == "poll"
     assert bench.scheduler.next_turn(5.049) is None
@@ -191,19 +192,19 @@ def test_polls_of_one_rate_are_spread_over_their_period() -> None:
 
 def test_missed_polls_are_counted_and_the_count_survives_new_polls() -> None:
     bench = Bench(1)
-    bench.scheduler.set_polls([poll("a", 10, 1)], 0.0)
+    bench.scheduler.polls.set([poll("a", 10, 1)], 0.0)
     assert kind(bench.scheduler.next_turn(0.55)) == "poll"
-    assert bench.scheduler.missed_polls == 5
-    bench.scheduler.set_polls([poll("a", 10, 1)], 1.0)
-    assert bench.scheduler.missed_polls == 5
-    bench.scheduler.set_polls([], 1.0)
-    assert (bench.scheduler.missed_polls, bench.scheduler.wake()) == (5, None)
+    assert bench.scheduler.polls.missed == 5
+    bench.scheduler.polls.set([poll("a", 10, 1)], 1.0)
+    assert bench.scheduler.polls.missed == 5
+    bench.scheduler.polls.set([], 1.0)
+    assert (bench.scheduler.polls.missed, bench.scheduler.wake()) == (5, None)
 
 
 def test_a_poll_of_nobody_who_can_be_reached_costs_no_turn() -> None:
     bench = Bench(1, 2)
     bench.take_offline(1)
-    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
+    bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
     taken = bench.scheduler.next_turn(0.05)
     assert taken is not None
     assert taken.request is not None
@@ -513,7 +514,7 @@ def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) ->
     rng, now, limit, nodes = random.Random(seed), 0.0, 8, (1, 2, 3, 4)
     bench, jobs = Bench(*nodes, limit=limit, most=2), list[Job]()
     accepted, ended = Counter[str](), Ended()
-    bench.scheduler.set_polls([poll("feedback", 200, *nodes)], now)
+    bench.scheduler.polls.set([poll("feedback", 200, *nodes)], now)
 
     def submit() -> None:
         new = job(rng.choice(nodes), expires=now + rng.uniform(0.01, 0.1), motion=rng.random() < 0.2)

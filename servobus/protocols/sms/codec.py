@@ -100,6 +100,9 @@ class SmsCodec:
         buffer = self._buffer
         if not buffer:
             return None
+        if self._is_one_packet(buffer):
+            self._buffer = b""
+            return Packet(buffer[2], buffer[4], buffer[5:-1], buffer)
         start = 0
         while True:
             found = buffer.find(HEADER, start)
@@ -125,6 +128,18 @@ class SmsCodec:
             self.skipped += found
             self._buffer = buffer[end:]
             return Packet(servo_id, buffer[found + 4], buffer[found + 5 : end - 1], buffer[found:end])
+
+    @staticmethod
+    def _is_one_packet(data: bytes) -> bool:
+        """What is heard nearly always: one whole packet, and nothing else."""
+        size = len(data)
+        return (
+            size >= OVERHEAD
+            and data[3] == size - 4
+            and data[:2] == HEADER
+            and data[2] <= BROADCAST_ID
+            and ~sum(data[2:-1]) & 0xFF == data[-1]
+        )
 
     def describe(self, frame: bytes, *, sent: bool) -> str:
         return describe(frame, sent=sent)
