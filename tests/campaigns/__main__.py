@@ -10,20 +10,27 @@ from collections.abc import Callable
 import structlog
 
 from tests.campaigns import faults, line, turns
+from tests.campaigns.oracle import ORACLES
 
 
 def soak_faults(count: int) -> bool:
-    result = faults.faults(count)
-    result.report("1 % mixed faults, replies delivered whole")
-    residual = faults.faults(count // 10, chop="bytes")
-    residual.report("the same, delivered byte by byte (the residual of an 8-bit sum)")
-    return not (result.wrong or result.leaked or result.waiting)
+    kept = True
+    for protocol in ORACLES:
+        result = faults.faults(count, protocol=protocol)
+        result.report(f"{protocol}: 1 % mixed faults, replies delivered whole")
+        residual = faults.faults(count // 10, protocol=protocol, chop="bytes")
+        residual.report(f"{protocol}: the same, delivered byte by byte (the residual of an 8-bit sum)")
+        kept &= not (result.wrong or result.leaked or result.waiting)
+    return kept
 
 
 def soak_cancel(count: int) -> bool:
-    result = faults.cancel(count // 10)
-    result.report("cancelled callers")
-    return not (result.wrong or result.leaked or result.waiting)
+    kept = True
+    for protocol in ORACLES:
+        result = faults.cancel(count // 10, protocol=protocol)
+        result.report(f"{protocol}: cancelled callers")
+        kept &= not (result.wrong or result.leaked or result.waiting)
+    return kept
 
 
 def soak_line(_: int) -> bool:

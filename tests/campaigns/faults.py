@@ -11,7 +11,8 @@ import random
 from dataclasses import dataclass, field
 from typing import Literal
 
-from servobus.errors import ReplyTimeout
+from servobus.bus.service import BusService
+from servobus.errors import ServobusError
 from servobus.protocols.options import FaultOptions
 from tests.campaigns.oracle import SERVOS, Oracle, service
 from tests.virtual import VirtualLoop
@@ -48,15 +49,22 @@ def options(share: float, *, chop: Literal["whole", "bytes", "random"] = "whole"
     return FaultOptions(**each, chop=chop, delay_ms=LATE_MS, seed=seed)
 
 
-def faults(reads: int, *, share: float = 0.01, chop: Literal["whole", "bytes", "random"] = "whole", seed: int = 1) -> Result:
+def faults(
+    reads: int,
+    *,
+    protocol: str = "sms",
+    share: float = 0.01,
+    chop: Literal["whole", "bytes", "random"] = "whole",
+    seed: int = 1,
+) -> Result:
     """So many reads by twelve callers of ten servos."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        return runner.run(_faults(reads, options(share, chop=chop, seed=seed), seed))
+        return runner.run(_faults(reads, protocol, options(share, chop=chop, seed=seed), seed))
 
 
-async def _faults(reads: int, damage: FaultOptions, seed: int) -> Result:
+async def _faults(reads: int, protocol: str, damage: FaultOptions, seed: int) -> Result:
     result = Result()
-    bus, link, oracle = service(SERVOS, damage)
+    bus, link, oracle = service(protocol, damage)
     await link.connect(bus.master)
     await bus.start()
 
@@ -69,19 +77,19 @@ async def _faults(reads: int, damage: FaultOptions, seed: int) -> Result:
     return await _end(bus, result)
 
 
-async def _read(bus, oracle: Oracle, rng: random.Random, result: Result, node: int) -> None:  # type: ignore[no-untyped-def]
-    address, size = rng.choice(((56, 2), (58, 2), (56, 4), (56, 6), (40, 3), (56, 15)))
+async def _read(bus: BusService, oracle: Oracle, rng: random.Random, result: Result, node: int) -> None:
+    register = oracle.register(rng)
     asked = asyncio.get_running_loop().time()
     try:
-        value = await bus.read_register(f"s{node}", f"{address}:{size}")
-    except ReplyTimeout:
+        value = await bus.read_register(f"s{node}", register, raw=True)
+    except ServobusError:
         result.timeouts += 1
     else:
         result.reads += 1
-        result.wrong += not oracle.right(value, node, address, asked)
+        result.wrong += not oracle.right(value, node, register, asked)
 
 
-async def _end(bus, result: Result) -> Result:  # type: ignore[no-untyped-def]
+async def _end(bus: BusService, result: Result) -> Result:
     result.turns = bus.stats.counts["turns"]
     result.waiting = bus.scheduler.waiting()
     result.counts = dict(bus.stats.counts)
@@ -90,15 +98,15 @@ async def _end(bus, result: Result) -> Result:  # type: ignore[no-untyped-def]
     return result
 
 
-def cancel(cancels: int, *, seed: int = 1) -> Result:
+def cancel(cancels: int, *, protocol: str = "sms", seed: int = 1) -> Result:
     """So many callers cancelled, each at a random moment of its call."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        return runner.run(_cancel(cancels, seed))
+        return runner.run(_cancel(cancels, protocol, seed))
 
 
-async def _cancel(cancels: int, seed: int) -> Result:
+async def _cancel(cancels: int, protocol: str, seed: int) -> Result:
     result, rng = Result(), random.Random(seed)
-    bus, link, oracle = service(SERVOS, options(0.01, seed=seed))
+    bus, link, oracle = service(protocol, options(0.01, seed=seed))
     await link.connect(bus.master)
     await bus.start()
     while result.cancelled < cancels:

@@ -1,16 +1,18 @@
-"""A line whose every answer is different and says which question it answers, so that a wrong one cannot pass for right.
+"""Lines whose every answer is different and says which question it answers, so that a wrong one cannot pass for right.
 
-The last two bytes of an answer are a number that counts up; what was asked, of whom and when, is remembered under it. The bytes
-before follow from the number. A value is right when it answers the question that its caller asked, and no earlier one.
+An answer carries a number that counts up; what was asked, of whom and when, is remembered under it. A value is right when it
+answers the question that its caller asked, and no earlier one. There is one oracle for each protocol.
 """
 
 from __future__ import annotations
 
 import asyncio
 import random
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from servobus.bus.service import BusService
 from servobus.config import parse_config
@@ -18,30 +20,34 @@ from servobus.links.base import Link
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
+from servobus.protocols.kst.codec import Command, KstCodec
+from servobus.protocols.kst.codec import encode as kst_encode
 from servobus.protocols.options import FaultOptions
-from servobus.protocols.sms.codec import Instruction, Packet, SmsCodec, encode, node_of
+from servobus.protocols.sms.codec import Instruction, SmsCodec
+from servobus.protocols.sms.codec import encode as sms_encode
 from servobus.protocols.table import PROTOCOLS
 
 SERVOS = 10
 NUMBERS = 1 << 16
-ID_ADDRESS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
     node: int
-    address: int
-    size: int
+    what: Any
     heard: float
 
 
-class Oracle:
-    """A FarEnd of servos that answer READ from a counter, and acknowledge whatever else is addressed to them."""
+class Oracle(ABC):
+    """A FarEnd of ten servos."""
 
-    def __init__(self, nodes: Sequence[int], loop: asyncio.AbstractEventLoop) -> None:
-        self.nodes = frozenset(nodes)
+    head: str
+    """The config of its bus, up to the servos."""
+    servo: str
+    """More keys of each servo."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._codec = SmsCodec()
         self._deliver: Callable[[bytes], object] = bytes
         self._questions: list[Question | None] = [None] * NUMBERS
         self._count = 0
@@ -53,58 +59,131 @@ class Oracle:
         """It has none."""
 
     def receive(self, data: bytes) -> None:
-        self._codec.receive_data(data)
-        while (packet := self._codec.next_reply()) is not None:
-            if packet.id in self.nodes:
-                self._loop.call_soon(self._deliver, encode(packet.id, 0, self._answer(packet)))
+        reply = self.answer(data)
+        if reply is not None:
+            self._loop.call_soon(self._deliver, reply)
 
-    def _answer(self, packet: Packet) -> bytes:
-        if packet.code != Instruction.READ:
-            return b""
-        address, size = packet.params
-        if address == ID_ADDRESS:
-            return bytes((packet.id, *bytes(size - 1)))
-        if size < 2:
-            return bytes(size)  # too short for a number: asked only at the introduction
-        self._count = number = (self._count + 1) % NUMBERS
-        self._questions[number] = Question(packet.id, address, size, self._loop.time())
-        return answer(number, size)
+    @abstractmethod
+    def answer(self, frame: bytes) -> bytes | None:
+        """To one whole frame."""
 
-    def right(self, value: Sequence[int], node: int, address: int, asked: float) -> bool:
-        """Whether this is the answer to a question asked of that node, up to the end of that span, not before `asked`. (A
-        question may begin a byte earlier than its caller's span: so it is put where its echo could be the answer.)"""
-        size = len(value)
-        number = int.from_bytes(bytes(value[-2:]), "little")
+    @abstractmethod
+    def register(self, rng: random.Random) -> str:
+        """Something to read."""
+
+    @abstractmethod
+    def right(self, value: Any, node: int, register: str, asked: float) -> bool:
+        """Whether this answers a question for that register, asked of that node not before `asked`."""
+
+    @abstractmethod
+    def rename(self, frame: bytes, rng: random.Random) -> bytes:
+        """The same reply in the name of the next servo, which exists."""
+
+    def _ask(self, node: int, what: Any, numbers: int = NUMBERS) -> int:
+        self._count = number = (self._count + 1) % numbers
+        self._questions[number] = Question(node, what, self._loop.time())
+        return number
+
+    def _asked(self, number: int, node: int, what: Any, asked: float) -> bool:
         question = self._questions[number]
-        return (
-            question is not None
-            and (question.node, question.address + question.size) == (node, address + size)
-            and question.heard >= asked
-            and bytes(value) == answer(number, question.size)[-size:]
-        )
+        return question is not None and (question.node, question.what) == (node, what) and question.heard >= asked
 
 
-def answer(number: int, size: int) -> bytes:
-    return bytes((number * at + at) & 0xFF for at in range(2, size)) + number.to_bytes(2, "little")
+class SmsOracle(Oracle):
+    """The number stands in the last two bytes read, and those before follow from it. The span's end tells what was asked: a question
+    may begin a byte earlier than its caller's span, so that its echo cannot be the answer."""
+
+    head = "    protocol: sms\n    baudrate: 1000000\n"
+    servo = ", model: sts"
+    ID_ADDRESS = 5
+    SPANS = ("56:2", "58:2", "56:4", "56:6", "40:3", "56:15")
+
+    def answer(self, frame: bytes) -> bytes | None:
+        codec = SmsCodec()
+        codec.receive_data(frame)
+        packet = codec.next_reply()
+        if packet is None or not 1 <= packet.id <= SERVOS:
+            return None
+        data = b""
+        if packet.code == Instruction.READ:
+            address, size = packet.params
+            if address == self.ID_ADDRESS:
+                data = bytes((packet.id, *bytes(size - 1)))
+            elif size < 2:
+                data = bytes(size)  # too short for a number: asked only at the introduction
+            else:
+                data = self._data(self._ask(packet.id, address + size), size)
+        return sms_encode(packet.id, 0, data)
+
+    def register(self, rng: random.Random) -> str:
+        return rng.choice(self.SPANS)
+
+    def right(self, value: Sequence[int], node: int, register: str, asked: float) -> bool:
+        address, size = map(int, register.split(":"))
+        number = int.from_bytes(bytes(value[-2:]), "little")
+        expected = self._data(number, size + 1)[-size:], self._data(number, size)
+        return self._asked(number, node, address + size, asked) and len(value) == size and bytes(value) in expected
+
+    def rename(self, frame: bytes, rng: random.Random) -> bytes:
+        return sms_encode(frame[2] % SERVOS + 1, frame[4], frame[5:-1])
+
+    @staticmethod
+    def _data(number: int, size: int) -> bytes:
+        return bytes((number * at + at) & 0xFF for at in range(2, size)) + number.to_bytes(2, "little")
 
 
-def _neighbour(frame: bytes, rng: random.Random) -> bytes:
-    """The same packet in the name of the next servo, which exists."""
-    return encode(frame[2] % SERVOS + 1, frame[4], frame[5:-1])
+class KstOracle(Oracle):
+    """Position, status and version are numbers. A position has to be one that is believed, so there are fewer of them."""
+
+    head = "    protocol: kst\n    baudrate: 512000\n"
+    servo = ""
+    REGISTERS = ("position", "status", "firmware")
+    POSITIONS = 1801
+    CODES = dict(zip(REGISTERS, (Command.READ_POSITION, Command.READ_STATUS, Command.READ_VERSION), strict=True))
+
+    def answer(self, frame: bytes) -> bytes | None:
+        codec = KstCodec()
+        codec.receive_data(frame)
+        heard = codec.next_reply()
+        if heard is None or not 1 <= heard.node <= SERVOS:
+            return None
+        command = Command(frame[3])
+        data = bytes((heard.node,))
+        if command != Command.READ_ID:
+            number = self._ask(heard.node, command, self.POSITIONS)
+            data = (
+                (number - 900).to_bytes(2, "little", signed=True)
+                if command == Command.READ_POSITION
+                else number.to_bytes(2, "little")
+            )
+        return kst_encode(heard.node, command + 0x40, data)
+
+    def register(self, rng: random.Random) -> str:
+        return rng.choice(self.REGISTERS)
+
+    def right(self, value: int, node: int, register: str, asked: float) -> bool:
+        number = value + 900 if register == "position" else value
+        return 0 <= number < self.POSITIONS and self._asked(number, node, self.CODES[register], asked)
+
+    def rename(self, frame: bytes, rng: random.Random) -> bytes:
+        return kst_encode(frame[2] % SERVOS + 1, frame[3], frame[4:12])
 
 
-def service(nodes: int, faults: FaultOptions | None = None, *, echo: str = "off") -> tuple[BusService, Link, Oracle]:
-    """A bus of so many servos on an oracle, with the faults in between; the link is to be connected."""
+ORACLES: dict[str, type[Oracle]] = {"sms": SmsOracle, "kst": KstOracle}
+
+
+def service(protocol: str, faults: FaultOptions) -> tuple[BusService, Link, Oracle]:
+    """A bus on an oracle, with the faults in between; the link is to be connected."""
     loop = asyncio.get_running_loop()
-    servos = "".join(f"      s{number}: {{id: {number}, model: sts}}\n" for number in range(1, nodes + 1))
-    head = "version: 1\nbuses:\n  arm:\n    protocol: sms\n    port: 'sim:'\n    baudrate: 1000000\n"
-    config = parse_config(f"{head}    echo: {echo}\n    servos:\n{servos}", "campaign", Path())
-    options, models = config.buses["arm"], config.models["arm"]
-    oracle = Oracle(range(1, nodes + 1), loop)
-    far = oracle if faults is None else FaultyEnd(oracle, faults, loop, rename=_neighbour, node_of=node_of)
+    oracle = ORACLES[protocol](loop)
+    servos = "".join(f"      s{number}: {{id: {number}{oracle.servo}}}\n" for number in range(1, SERVOS + 1))
+    text = f"version: 1\nbuses:\n  line:\n{oracle.head}    port: 'sim:'\n    servos:\n{servos}"
+    config = parse_config(text, "campaign", Path())
+    options, models = config.buses["line"], config.models["line"]
+    entry = PROTOCOLS[protocol]
+    far = FaultyEnd(oracle, faults, loop, rename=oracle.rename, node_of=entry.node_of)
     link = MemoryLink(far, LineTraits())
-    entry = PROTOCOLS[options.protocol]
-    bus = BusService("arm", options, entry.driver(options, models), entry.codec(options), link.traits, _event)
+    bus = BusService("line", options, entry.driver(options, models), entry.codec(options), link.traits, _event)
     return bus, link, oracle
 
 

@@ -8,15 +8,16 @@ import pytest
 
 from tests.campaigns import faults, line
 from tests.campaigns.faults import KINDS, Result
+from tests.campaigns.oracle import ORACLES
 
 
 def assert_right(result: Result) -> None:
     assert (result.wrong, result.leaked, result.waiting) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_faults(seed: int) -> None:
-    result = faults.faults(20_000, seed=seed)
+@pytest.mark.parametrize(("protocol", "seed"), [("sms", 1), ("sms", 2), ("kst", 1), ("kst", 2)])
+def test_faults(protocol: str, seed: int) -> None:
+    result = faults.faults(20_000, protocol=protocol, seed=seed)
     assert_right(result)
     assert result.reads > 19_000
     assert result.counts["timeouts"] > 100, "the line was as bad as it should be"
@@ -27,14 +28,16 @@ def test_faults_in_pieces(chop: Literal["bytes", "random"]) -> None:
     assert_right(faults.faults(3000, chop=chop))
 
 
-def test_a_very_bad_line_is_slow_and_right() -> None:
-    result = faults.faults(3000, share=0.2)
+@pytest.mark.parametrize("protocol", ORACLES)
+def test_a_very_bad_line_is_slow_and_right(protocol: str) -> None:
+    result = faults.faults(3000, protocol=protocol, share=0.2)
     assert_right(result)
     assert result.timeouts > 0
 
 
-def test_cancelled_callers() -> None:
-    result = faults.cancel(3000)
+@pytest.mark.parametrize("protocol", ORACLES)
+def test_cancelled_callers(protocol: str) -> None:
+    result = faults.cancel(3000, protocol=protocol)
     assert_right(result)
     assert result.cancelled >= 3000
     assert result.reads > 1000

@@ -25,26 +25,23 @@ SWING = 30.0
 """Degrees to either side."""
 PERIOD = 4.0
 """Seconds of one swing."""
-CONFIG = f"""
-version: 1
-buses:
-  arm:
-    protocol: sms
-    port: "sim:"
-    baudrate: 1000000
-    poll: {{{{feedback: {FEEDBACK_HZ:g}}}}}
-    goal_rate: {GOAL_HZ:g}
-    servos:
-{{sts}}
-  base:
-    protocol: sms
-    port: "sim:"
-    baudrate: 115200
-    poll: {{{{feedback: {FEEDBACK_HZ:g}}}}}
-    goal_rate: {GOAL_HZ:g}
-    servos:
-{{sms}}
-"""
+LINES = {
+    "arm": ("sms", 1_000_000, "sts", 6),
+    "base": ("sms", 115_200, "sms", 4),
+    "gimbal": ("kst", 512_000, "kst", 4),
+}
+"""Bus -> protocol, baud rate, model and number of its servos."""
+
+
+def config_text() -> str:
+    """The simulated rig."""
+    text = "version: 1\nbuses:\n"
+    for bus, (protocol, baudrate, model, count) in LINES.items():
+        text += f"  {bus}:\n    protocol: {protocol}\n    port: 'sim:'\n    baudrate: {baudrate}\n"
+        text += f"    poll: {{feedback: {FEEDBACK_HZ:g}}}\n    goal_rate: {GOAL_HZ:g}\n    servos:\n"
+        for number in range(1, count + 1):
+            text += f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}\n"
+    return text
 
 
 @dataclass(slots=True)
@@ -59,21 +56,14 @@ class Tally:
 @click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="How long to stream.")
 @click.option("--json", "as_json", is_flag=True, help="For machines.")
 def demo(seconds: float, as_json: bool) -> int:
-    """Stream goals to ten simulated servos on two lines with real wire time, and print what the lines carried.
+    """Stream goals to 14 simulated servos on three lines with real wire time, and print what the lines carried.
 
-    Six STS at 1 Mbaud and four SMS at 115200 baud; one caller per servo sends 100 goals a second, feedback is polled at 50 Hz.
+    Six STS at 1 Mbaud, four SMS at 115200 baud and four KST at 512000; one caller per servo sends 100 goals a second, feedback is polled at 50 Hz.
 
     Example: servobus demo --seconds 3
     """
     logs(logging.ERROR)
-    servos = {"sts": 6, "sms": 4}
-    lines = {
-        model: "\n".join(
-            f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}" for number in range(1, count + 1)
-        )
-        for model, count in servos.items()
-    }
-    config = parse_config(CONFIG.format(**lines), "demo")
+    config = parse_config(config_text(), "demo")
     if not as_json:
         for name, load in loads_of(config).items():
             options = config.buses[name]
