@@ -55,7 +55,7 @@ class Oracle(ABC):
     def attach(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver
 
-    def set_baudrate(self, baudrate: int) -> None:
+    def set_baudrate(self, baudrate: int) -> None:  # noqa: B027 - there is nothing to do: it hears every rate
         """It has none."""
 
     def receive(self, data: bytes) -> None:
@@ -90,8 +90,8 @@ class Oracle(ABC):
 
 
 class SmsOracle(Oracle):
-    """The number stands in the last two bytes read, and those before follow from it. The span's end tells what was asked: a question
-    may begin a byte earlier than its caller's span, so that its echo cannot be the answer."""
+    """The number stands in the last two bytes read, and those before follow from it. The span's end tells what was asked: a
+    question may begin a byte earlier than its caller's span, so that its echo cannot be the answer."""
 
     head = "    protocol: sms\n    baudrate: 1000000\n"
     servo = ", model: sts"
@@ -151,11 +151,8 @@ class KstOracle(Oracle):
         data = bytes((heard.node,))
         if command != Command.READ_ID:
             number = self._ask(heard.node, command, self.POSITIONS)
-            data = (
-                (number - 900).to_bytes(2, "little", signed=True)
-                if command == Command.READ_POSITION
-                else number.to_bytes(2, "little")
-            )
+            least = -900 if command == Command.READ_POSITION else 0
+            data = (number + least).to_bytes(2, "little", signed=True)
         return kst_encode(heard.node, command + 0x40, data)
 
     def register(self, rng: random.Random) -> str:
