@@ -119,11 +119,12 @@ class Line:
         return max(self._quiet_at, self._last_start)
 
     def next_at(self, size: int, now: float) -> float | None:
-        """When a frame may be handed over behind one whose answer is due: so much later that the answers (of `size` bytes) cannot
-        meet. None: not before that answer is here."""
+        """When a frame may be handed over behind one whose answer is due, so that the answers (of `size` bytes) cannot meet. Where
+        all servos pause alike, the UART itself keeps frames apart: one may wait in it. None: not before that answer is here."""
         if self.spread is None or now < self.half_until or self._listening_since is not None:
             return None
-        return max(self._quiet_at, self._last_start + size * self.traits.byte_time + self.spread)
+        apart = size * self.traits.byte_time + self.spread if self.spread else 0.0
+        return max(self._quiet_at, self._last_start + apart)
 
     def quiet(self) -> None:
         """It was listened out, and is about to be spoken on."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import faults, line, turns
+from tests.campaigns import faults, kst, line, turns
 from tests.campaigns.oracle import ORACLES
 
 
@@ -49,9 +49,13 @@ def bench_turns(_: int) -> bool:
     return best >= 0.45 and best > ratios["feetech-servo-sdk"]
 
 
+def bench_kst(_: int) -> bool:
+    return min(kst.main().values()) >= 0.9
+
+
 CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
     "soak": {"faults": soak_faults, "cancel": soak_cancel, "line": soak_line},
-    "bench": {"turns": bench_turns},
+    "bench": {"turns": bench_turns, "kst": bench_kst},
 }
 
 
