@@ -25,7 +25,7 @@ from servobus.links import open_link
 from servobus.links.base import Link
 from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
-from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
+from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Rig, Snapshot, outcomes, raise_failures
 from servobus.sim.build import SimLink, simulated_link
 
@@ -210,17 +210,6 @@ class LocalRig(Rig):
     def snapshot(self) -> Snapshot:
         return {name: self.buses[bus].state(servo) for name, (bus, servo) in self._names.items()}
 
-    async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
-        if not 0 < hz <= 1000:
-            raise ValueError(f"watch: {hz} Hz is outside 0 to 1000")
-        clock = asyncio.get_running_loop().time
-        due = clock()
-        while True:
-            yield self.snapshot()
-            now = clock()
-            due += max(1.0, -(-(now - due) * hz // 1)) / hz  # the next point of the grid that has not passed
-            await asyncio.sleep(due - now)
-
     async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:
         bus, servo = self.bus_of(name)
         return await bus.read_register(servo, register, raw=raw)
@@ -245,9 +234,7 @@ class LocalRig(Rig):
         ids: Iterable[int] = (),
         progress: Callable[[int, int, Found | None], None] | None = None,
     ) -> list[Found]:
-        if bus not in self.buses:
-            raise UnknownName(f"no bus {bus!r}: there are {', '.join(self.buses)}")
-        service = self.buses[bus]
+        service = self._bus(bus)
         every = PROTOCOLS[service.options.protocol].scan_ids
         found = []
         async for asked, count, entry in scan(service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)):
@@ -257,6 +244,17 @@ class LocalRig(Rig):
             if progress:
                 progress(asked, count, hit)
         return found
+
+    async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
+        return await self._bus(bus).commission(node, lambda plans: plans.set_id(node, new, save=save))
+
+    async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
+        return await self._bus(bus).commission(node, lambda plans: plans.set_baudrate(node, baudrate, save=save))
+
+    def _bus(self, name: str) -> BusService:
+        if name not in self.buses:
+            raise UnknownName(f"no bus {name!r}: there are {', '.join(self.buses)}")
+        return self.buses[name]
 
     def stats(self) -> dict[str, Any]:
         return {name: bus.snapshot() for name, bus in self.buses.items()}

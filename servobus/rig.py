@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from servobus.errors import PartialFailure, ServobusError, UnknownName
-from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
+from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 
 Snapshot = dict[str, State]
 """Every servo's last known state, by full name."""
@@ -213,9 +213,17 @@ class Rig(ABC):
     def snapshot(self) -> Snapshot:
         """What is known now, without a turn."""
 
-    @abstractmethod
-    def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
+    async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
         """Snapshots at a rate; a slow reader gets fewer, never old ones."""
+        if not 0 < hz <= 1000:
+            raise ValueError(f"watch: {hz} Hz is outside 0 to 1000")
+        clock = asyncio.get_running_loop().time
+        due = clock()
+        while True:
+            yield self.snapshot()
+            now = clock()
+            due += max(1.0, -(-(now - due) * hz // 1)) / hz  # the next point of the grid that has not passed
+            await asyncio.sleep(due - now)
 
     @abstractmethod
     async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any: ...
@@ -240,6 +248,15 @@ class Rig(ABC):
     ) -> list[Found]:
         """Ask every id, at every rate (none given: the bus's own; every id). Polls pause and motion is refused meanwhile.
         `progress(asked, in all, what was found)`."""
+
+    @abstractmethod
+    async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
+        """Give the servo at this id another one; with `save` for good. Nothing on the bus may be enabled, and exactly one servo
+        must answer there. Raises LimitError, NotSupported, LeaseHeld, DeviceError. KST 3.2, 3.3."""
+
+    @abstractmethod
+    async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
+        """Give the servo at this id another baud rate, likewise. KST 3.1, 3.3."""
 
     @abstractmethod
     def stats(self) -> dict[str, Any]:

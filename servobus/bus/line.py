@@ -119,8 +119,8 @@ class Line:
         return max(self._quiet_at, self._last_start)
 
     def next_at(self, size: int, now: float) -> float | None:
-        """When a frame may be handed over behind one whose answer is due, so that the answers (of `size` bytes) cannot meet. Where
-        all servos pause alike, the UART itself keeps frames apart: one may wait in it. None: not before that answer is here."""
+        """When a frame may be handed over behind one whose answer is due, so that the answers (of `size` bytes) cannot meet.
+        Where all servos pause alike, the UART keeps frames apart: one may wait in it. None: not before that answer is here."""
         if self.spread is None or now < self.half_until or self._listening_since is not None:
             return None
         apart = size * self.traits.byte_time + self.spread if self.spread else 0.0

@@ -21,9 +21,9 @@ from servobus.bus.runner import Runner
 from servobus.bus.scheduler import Scheduler
 from servobus.bus.stats import BusStats
 from servobus.errors import LeaseHeld, LinkDown, NotSupported, ReplyTimeout, ServobusError
-from servobus.protocols.base import Codec, Driver, LineTraits, Plan, Request
+from servobus.protocols.base import Codec, Commissioning, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
-from servobus.protocols.words import Identity, State, Update
+from servobus.protocols.words import Change, Identity, State, Update
 from servobus.timerfd import clock_of
 
 R = TypeVar("R")
@@ -226,6 +226,15 @@ class BusService:
             self.scheduler.session = None
             if self.master.up:
                 self.master.goals_waiting()
+
+    async def commission(self, node: int, plan_of: Callable[[Commissioning], Plan[Change]]) -> Change:
+        """A change of id or rate, alone on the line and with nothing enabled. Raises NotSupported, LeaseHeld, LimitError,
+        DeviceError."""
+        if self.driver.commissioning is None:
+            raise NotSupported("servos of this bus are given ids and rates with the vendor's tool", bus=self.name)
+        plan = plan_of(self.driver.commissioning)
+        async with self.exclusive() as session:
+            return await self.perform(plan, node, urgent=True, session=session)
 
     # What the engine tells
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Generator, Hashable, Mapping, 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
-from servobus.protocols.words import Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
+from servobus.protocols.words import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
@@ -165,12 +165,26 @@ class Poll:
     request: Callable[[Collection[int]], Request[dict[str, Update]] | None]
 
 
+class Commissioning(Protocol):
+    """Gives servos their ids and rates: one change at a time, read back, saved on request. For exclusive sessions."""
+
+    def set_id(self, node: int, new: int, *, save: bool = False) -> Plan[Change]:
+        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected, or `new` answers already."""
+
+    def set_baudrate(self, node: int, baudrate: int, *, save: bool = False) -> Plan[Change]:
+        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected."""
+
+
 class Driver(Protocol):
     """A protocol's verbs on one bus: what to say for each. Sans-IO; knows its servos by name and every node by id."""
 
     @property
     def nodes(self) -> Mapping[str, int]:
         """Servo name to node."""
+
+    @property
+    def commissioning(self) -> Commissioning | None:
+        """None: this protocol's servos are given ids and rates with other tools."""
 
     def step(self, servo: str) -> float:
         """The size of one raw step in the servo's unit."""

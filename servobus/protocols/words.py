@@ -145,6 +145,24 @@ class StopReport:
     detail: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What was changed, and whether the servo goes by it already."""
+
+    node: int
+    """Where it was changed."""
+    what: Literal["id", "baudrate"]
+    value: int
+    saved: bool = False
+    pending_reboot: bool = True
+    """It takes effect when the servo is saved and restarted; until then it answers as before."""
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        step = "restart the servo" if self.saved else "save and restart the servo"
+        return f"pending_reboot: {self.what} {self.value} is set and not in effect yet: {step}"
+
+
 def is_number(value: object) -> bool:
     """A finite number that is no boolean."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):

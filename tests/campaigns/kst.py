@@ -1,4 +1,4 @@
-"""A poll of twelve KST servos on a paced line at 512000 baud, half and full duplex, beside a bare descriptor loop of the same duplex.
+"""A poll of twelve KST servos on a paced line at 512000 baud, half and full duplex, beside a bare loop of the same duplex.
 
 The responder holds each frame for its wire time on each of two pairs of wires, and spins for it, so it keeps one core busy; the
 client has the other. The bare loop checks nothing: it writes the next question when an answer is here (half), or keeps three

@@ -33,6 +33,8 @@ COMMANDS = {
     "disable": "motion",
     "stop": "motion",
     "clear": "motion",
+    "set-id": "commission",
+    "set-baud": "commission",
 }
 """Command -> the module beside this one that has it."""
 INTERRUPTED = 130
@@ -48,7 +50,7 @@ class Commands(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"servobus.doors.cli.{COMMANDS[cmd_name]}")
-        command: click.Command = getattr(module, cmd_name)
+        command: click.Command = getattr(module, cmd_name.replace("-", "_"))
         return command
 
 

@@ -91,12 +91,14 @@ def simulated(config: Config) -> Config:
 
 
 @asynccontextmanager
-async def opened(options: Options, names: Collection[str] = (), *, degraded: bool = False) -> AsyncIterator[LocalRig]:
-    """A rig with the buses of these servos, or with all; `degraded`: without those whose port cannot be opened. Raises
-    UnknownName before a port is opened, and DeviceError when a servo did not confirm how it was left."""
+async def opened(
+    options: Options, names: Collection[str] = (), *, only: Collection[str] = (), degraded: bool = False
+) -> AsyncIterator[LocalRig]:
+    """A rig with the buses of these servos, or with `only` these, or with all; `degraded`: without those whose port cannot be
+    opened. Raises UnknownName before a port is opened, and DeviceError when a servo did not confirm how it was left."""
     config = options.setup
     full = [full_name(config.names, name) for name in names]
-    buses = dict.fromkeys(config.names[name][0] for name in full)
+    buses = dict.fromkeys([*only, *(config.names[name][0] for name in full)])
     async with traced(config, options) as trace, open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
         yield rig
     doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]

@@ -58,7 +58,8 @@ class Tally:
 def demo(seconds: float, as_json: bool) -> int:
     """Stream goals to 14 simulated servos on three lines with real wire time, and print what the lines carried.
 
-    Six STS at 1 Mbaud, four SMS at 115200 baud and four KST at 512000; one caller per servo sends 100 goals a second, feedback is polled at 50 Hz.
+    Six STS at 1 Mbaud, four SMS at 115200 baud and four KST at 512000; one caller per servo sends 100 goals a second,
+    feedback is polled at 50 Hz.
 
     Example: servobus demo --seconds 3
     """

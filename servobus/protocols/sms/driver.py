@@ -45,6 +45,10 @@ class SmsDriver:
     def acknowledged(self) -> bool:
         return self._writer.acknowledged
 
+    @property
+    def commissioning(self) -> None:
+        """FEETECH servos are given ids and rates with the vendor's tool."""
+
     def step(self, servo: str) -> float:
         return self.servos[servo].calibration.unit_per_step
 

@@ -1,0 +1,63 @@
+"""Commands that give servos their ids and rates: set-id, set-baud."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import click
+
+from servobus.doors.cli.common import Options, emit, logs, opened, run, servo_options
+from servobus.errors import UnknownName
+from servobus.local import LocalRig
+from servobus.protocols.words import Change
+
+Id = click.IntRange(0, 255)
+
+
+@click.command("set-id")
+@click.argument("bus")
+@click.argument("old", type=Id)
+@click.argument("new", type=Id)
+@click.option("--save", is_flag=True, help="Write it to the servo's flash; without, a restart forgets it.")
+@servo_options
+def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
+    """Give the servo with id OLD on a bus of the config the id NEW.
+
+    Nothing on the bus is moved or enabled. Refused when two servos seem to answer at OLD, or one at NEW. Then change the config.
+
+    Example: servobus set-id gimbal 37 38 --save
+    """
+    return _change(options, bus, lambda rig: rig.set_id(bus, old, new, save=save))
+
+
+@click.command("set-baud")
+@click.argument("bus")
+@click.argument("servo_id", metavar="ID", type=Id)
+@click.argument("baudrate", type=click.IntRange(min=1))
+@click.option("--save", is_flag=True, help="Write it to the servo's flash; without, a restart forgets it.")
+@servo_options
+def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: bool) -> int:
+    """Give the servo with this id on a bus of the config another baud rate. Then change the config, when all servos have it.
+
+    Example: servobus set-baud gimbal 37 115200 --save
+    """
+    return _change(options, bus, lambda rig: rig.set_baudrate(bus, servo_id, baudrate, save=save))
+
+
+def _change(options: Options, bus: str, verb: Callable[[LocalRig], Awaitable[Change]]) -> int:
+    logs()
+
+    async def main() -> int:
+        if bus not in options.setup.buses:
+            raise UnknownName(f"no bus {bus!r}: there are {', '.join(options.setup.buses)}")
+        async with opened(options, only=[bus]) as rig:
+            change = await verb(rig)
+            if options.as_json:
+                emit(change)
+            else:
+                click.echo(str(change) if change.pending_reboot else f"{change.what} {change.value} is in effect")
+                for note in change.notes:
+                    click.echo(note)
+            return 0
+
+    return run(main)

@@ -1,0 +1,69 @@
+"""The same app code moves a joint of any protocol."""
+
+from __future__ import annotations
+
+import pytest
+
+from servobus.config import parse_config
+from servobus.errors import EStopped, LimitError, NotEnabled
+from servobus.local import open_rig
+from servobus.protocols.words import Outcome
+from tests.virtual import virtual
+
+JOINTS = {
+    "sms": "    protocol: sms\n    baudrate: 1000000\n    servos: {joint: {id: 1, model: sts, limits: [-60, 60], max_speed: 90}}\n",
+    "kst": "    protocol: kst\n    baudrate: 512000\n    servos: {joint: {id: 37, limits: [-60, 60], max_speed: 90}}\n",
+}
+
+
+@pytest.mark.parametrize("protocol", JOINTS)
+@virtual
+async def test_one_app_for_every_joint(protocol: str) -> None:
+    text = f"version: 1\nbuses:\n  line:\n    port: 'sim:'\n    poll: {{feedback: 50}}\n{JOINTS[protocol]}"
+    async with open_rig(parse_config(text, "app")) as rig:
+        joint = rig["joint"]
+        with pytest.raises(NotEnabled):
+            await joint.move_to(10)
+        await joint.enable()
+        with pytest.raises(LimitError):
+            await joint.move_to(60.1)
+        assert await joint.move_to(30) is Outcome.ACKED
+        state = await joint.settle()
+        assert state.position == pytest.approx(30, abs=1)
+        assert await joint.move_to(-10, speed=45) is Outcome.ACKED
+        assert (await joint.settle()).position == pytest.approx(-10, abs=1)
+        assert await joint.move_to(0, duration=0.5) is Outcome.ACKED
+        reports = await rig.stop()
+        assert reports["line/joint"].confirmed
+        with pytest.raises(EStopped):
+            await joint.move_to(0)
+        await rig.clear()
+        await joint.disable()
+        async for snapshot in rig.watch(hz=50):
+            assert not snapshot["line/joint"].enabled
+            break
+
+
+@virtual
+async def test_a_led_servo_keeps_its_speed_and_stops_where_it_is() -> None:
+    text = f"version: 1\nbuses:\n  line:\n    port: 'sim:'\n    goal_rate: 100\n    poll: {{feedback: 100}}\n{JOINTS['kst']}"
+    async with open_rig(parse_config(text, "app")) as rig:
+        joint = rig["joint"]
+        await joint.enable()
+        await joint.move_to(60, speed=30)
+        places: list[float] = []
+        async for snapshot in rig.watch(hz=20):
+            position = snapshot["line/joint"].position
+            assert position is not None
+            places.append(position)
+            if len(places) == 21:
+                break
+        assert places[-1] - places[0] == pytest.approx(30, abs=2), "one second at 30 degrees/s"
+        await rig.stop()
+        stopped = (await joint.read()).position
+        await rig.clear()
+        async for snapshot in rig.watch(hz=2):
+            if len(places) == 23:
+                break
+            places.append(snapshot["line/joint"].position or 0.0)
+        assert places[-1] == stopped, "nobody leads it any further"
