@@ -81,7 +81,7 @@ class LocalRig(Rig):
 
     # Lines
 
-    async def keep(self, name: str) -> None:
+    async def keep(self, name: str, degraded: bool) -> None:
         """Open the line, and again whenever it is gone. Ends by being cancelled."""
         bus, link = self.buses[name], self.links[name]
         while True:
@@ -89,7 +89,8 @@ class LocalRig(Rig):
             try:
                 await link.connect(bus.master)
             except LinkDown as error:
-                if str(error) != str(self._down.get(name)):
+                tried = self._tried[name].is_set()  # the first time it may be raised, and need not be told twice
+                if (tried or degraded) and str(error) != str(self._down.get(name)):
                     self._event("waiting_for_port", bus=name, port=link.address, reason=error.message)
                 self._down[name] = error
                 self._tried[name].set()
@@ -284,7 +285,7 @@ async def open_rig(
     async with anyio.create_task_group() as keepers:
         try:
             for name in rig.buses:
-                keepers.start_soon(rig.keep, name)
+                keepers.start_soon(rig.keep, name, degraded)
             await rig.ready(degraded=degraded)
             yield rig
         except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
