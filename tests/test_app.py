@@ -10,9 +10,10 @@ from servobus.local import open_rig
 from servobus.protocols.words import Outcome
 from tests.virtual import virtual
 
+KEYS = "limits: [-60, 60], max_speed: 90"
 JOINTS = {
-    "sms": "    protocol: sms\n    baudrate: 1000000\n    servos: {joint: {id: 1, model: sts, limits: [-60, 60], max_speed: 90}}\n",
-    "kst": "    protocol: kst\n    baudrate: 512000\n    servos: {joint: {id: 37, limits: [-60, 60], max_speed: 90}}\n",
+    "sms": f"    protocol: sms\n    baudrate: 1000000\n    servos: {{joint: {{id: 1, model: sts, {KEYS}}}}}\n",
+    "kst": f"    protocol: kst\n    baudrate: 512000\n    servos: {{joint: {{id: 37, {KEYS}}}}}\n",
 }
 
 

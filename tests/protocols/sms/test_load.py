@@ -8,21 +8,22 @@ from pathlib import Path
 import pytest
 
 from servobus.errors import ConfigError
-from servobus.protocols.sms.load import FOLDER, find_model, merged, packaged_models, read_model
+from servobus.protocols.modelfile import merged
+from servobus.protocols.sms.load import FILES, packaged_models
 
 
 def test_names_and_files(tmp_path: Path) -> None:
-    assert find_model("sts", tmp_path) is packaged_models()["sts"]
+    assert FILES.find("sts", tmp_path) is packaged_models()["sts"]
     with pytest.raises(ConfigError, match="model 'stx' is not known; there are scs, sms, sms_cl, sts"):
-        find_model("stx", tmp_path)
+        FILES.find("stx", tmp_path)
     with pytest.raises(ConfigError, match="there is no such file"):
-        find_model("mine.yaml", tmp_path)
+        FILES.find("mine.yaml", tmp_path)
 
 
 def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("extends: sts\nname: mine\ntitle: Mine\nregisters: {goal_speed: {maximum: 500}}\n")
-    model = read_model(path)
+    model = FILES.read(path)
     assert model.registers["goal_speed"].maximum == 500
     assert model.registers["goal_speed"].address == 46
     assert packaged_models()["sts"].registers["goal_speed"].maximum != 500
@@ -57,13 +58,13 @@ def test_mistakes_in_a_model_file(text: str, told: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        read_model(path)
+        FILES.read(path)
     assert told in str(caught.value)
 
 
 def without(path: Path, pattern: str, instead: str) -> None:
     """A whole model file of its own with something changed that extending could not take away."""
-    text, count = re.subn(pattern, instead, (FOLDER / "sts.yaml").read_text(), count=1, flags=re.MULTILINE)
+    text, count = re.subn(pattern, instead, (FILES.folder / "sts.yaml").read_text(), count=1, flags=re.MULTILINE)
     assert count == 1
     path.write_text(text)
 
@@ -79,7 +80,7 @@ def without(path: Path, pattern: str, instead: str) -> None:
 def test_what_every_model_needs(pattern: str, instead: str, told: str, tmp_path: Path) -> None:
     without(tmp_path / "mine.yaml", pattern, instead)
     with pytest.raises(ConfigError, match=told):
-        read_model(tmp_path / "mine.yaml")
+        FILES.read(tmp_path / "mine.yaml")
 
 
 @pytest.mark.parametrize(
@@ -94,7 +95,7 @@ def test_what_every_model_needs(pattern: str, instead: str, told: str, tmp_path:
 )
 def test_what_a_register_can_just_hold(change: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"extends: sts\nregisters: {{{change}}}\n")
-    assert read_model(tmp_path / "mine.yaml").registers["lock"]
+    assert FILES.read(tmp_path / "mine.yaml").registers["lock"]
 
 
 def test_merging() -> None:
