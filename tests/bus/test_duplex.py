@@ -144,3 +144,14 @@ async def test_a_lost_line_ends_every_turn_in_flight() -> None:
         link_of(rig).unplug()
         results = await asyncio.gather(*calls, return_exceptions=True)
         assert all(type(result).__name__ == "LinkDown" for result in results), results
+
+
+@virtual
+async def test_a_plan_waits_until_the_line_is_empty_and_has_it_alone() -> None:
+    async with open_rig(config("full")) as rig:
+        reading = [asyncio.create_task(rig.read_register(f"k{number}", "position")) for number in range(1, SERVOS + 1)]
+        await asyncio.sleep(0)
+        identities = await asyncio.gather(*(rig.identify(f"k{number}") for number in (1, 2, 3)))
+        assert [identity.model for identity in identities] == ["kst"] * 3
+        assert await asyncio.gather(*reading) == [0.0] * SERVOS
+        assert link_of(rig).line.collisions == 0
