@@ -1,0 +1,32 @@
+"""KST servos on RS422: the seed's fixed frames of 14 bytes. Written from the specification, never seen on hardware."""
+
+from __future__ import annotations
+
+from servobus.protocols.entry import ProtocolEntry
+from servobus.protocols.kst.codec import KstCodec, node_of, rename
+from servobus.protocols.kst.device import devices
+from servobus.protocols.kst.driver import KstDriver
+from servobus.protocols.kst.load import load_models
+from servobus.protocols.kst.options import KstBus
+
+
+def codec(options: KstBus | None = None) -> KstCodec:
+    """For either end of the line; without options, as the seed has it."""
+    if options is None:
+        return KstCodec()
+    return KstCodec(options.version_byte, strict=options.pad_check == "strict")
+
+
+ENTRY = ProtocolEntry(
+    options=KstBus,
+    models=load_models,
+    codec=codec,
+    driver=KstDriver,
+    device_codec=codec,
+    devices=devices,
+    rename=rename,
+    node_of=node_of,
+    # The factory's first, then what RS422 is commonly set to.
+    baudrates=(512_000, 115_200, 921_600, 256_000, 57_600, 38_400, 19_200, 9_600),
+    scan_ids=range(1, 0xFF),
+)

@@ -1,0 +1,203 @@
+"""A simulated KST servo: the seed's section 3 from the other end of the line.
+
+Where the specification is silent it does this: what is no known command, or not addressed to it, gets no answer; of broadcasts it
+obeys set position alone and answers none; a value it cannot take is refused with an abort code of 0609; a new id or rate is
+kept aside until a restart, and lost by it unless it was saved; after a restart it goes to its default position. Each of these
+can be changed by an attribute, at any time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
+
+from servobus.protocols.base import DeviceReply
+from servobus.protocols.kst.codec import (
+    BAUD_TABLE,
+    BROADCAST,
+    FACTORY_ID,
+    REFUSED,
+    REPLY,
+    SAVE_WORD,
+    VERSION,
+    Command,
+    Frame,
+    decode_position,
+    encode,
+    encode_position,
+)
+from servobus.protocols.kst.model import KstModel
+from servobus.protocols.kst.options import KstBus
+
+TOO_HIGH, TOO_LOW, OUT_OF_RANGE = 0x06090031, 0x06090032, 0x06090030
+DELAY = 100e-6
+"""Seconds from command to reply; the documents name none."""
+
+Answer: TypeAlias = bytes | int | None
+"""Data of the reply, an abort code, or silence."""
+
+
+class KstDevice:
+    """One servo on the line."""
+
+    def __init__(
+        self,
+        model: KstModel,
+        servo_id: int = FACTORY_ID,
+        *,
+        baudrate: int = 512_000,
+        position: int = 0,
+        baud_table: Mapping[int, int] | None = None,
+        version: int = VERSION,
+        immediate: bool = False,
+    ) -> None:
+        self.model = model
+        self.node = servo_id
+        self.baudrate = baudrate
+        self.version = version
+        self.immediate = immediate
+        """A new id or rate is obeyed at once."""
+        self.firmware = model.firmware.encode().ljust(4, b"\0")
+        self.status_bytes = bytes(2)
+        self.position = self.goal = float(position)
+        """Steps."""
+        self.speed = model.max_steps_per_second
+        self.delay = DELAY
+        self.extra_delay = 0.0
+        """Seconds that its answers come too late."""
+        self.dead = False
+        """Hears and says nothing."""
+        self.refuses: dict[int, int] = {}
+        """Command -> abort code that it answers instead of obeying."""
+        self.says: dict[int, bytes] = {}
+        """Command -> data that it answers in place of the right ones."""
+        self.sdo_order = "be"
+        self.answers_save = False
+        self.answers_broadcasts = False
+        self.reads_goal = False
+        """Read position brings the goal, not the place."""
+        self._rates = dict(baud_table or BAUD_TABLE)
+        self._new = self._stored = (servo_id, baudrate)
+        """Id and rate that were set, and that were saved."""
+        self._at = -math.inf
+        self._awake = -math.inf
+
+    def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
+        """Obey a command, and answer it where the rules of the protocol say so."""
+        everybody = packet.address == BROADCAST
+        verb = VERBS.get(packet.code)
+        if verb is None or self.dead or now < self._awake or not (everybody or packet.address == self.node):
+            return ()
+        if everybody and not (self.answers_broadcasts or packet.code == Command.SET_POSITION):
+            return ()
+        self.advance(now)
+        address = self.node
+        answer = self.refuses.get(packet.code) or verb(self, packet.data)
+        if answer is None or (everybody and not self.answers_broadcasts):
+            return ()
+        if isinstance(answer, bytes):
+            answer = self.says.get(packet.code, answer)
+        return (DeviceReply(self._reply(address, packet.code, answer), self.delay, late=self.extra_delay),)
+
+    def advance(self, now: float) -> None:
+        """Be where it is at `now`."""
+        elapsed, self._at = now - self._at, max(now, self._at)
+        if 0 < elapsed < math.inf:
+            left = self.goal - self.position
+            way = self.speed * elapsed
+            self.position = self.goal if abs(left) <= way else self.position + math.copysign(way, left)
+
+    def reboot(self, now: float) -> None:
+        """Off and on: what was not saved is lost, and the goal is the default position."""
+        self.advance(now)
+        self._awake = now + self.model.reboot_s
+        self._new = self._stored
+        self._adopt()
+        self.goal = float(self.model.default_position)
+
+    # Commands
+
+    def set_baud(self, data: bytes) -> Answer:
+        if data[0] not in self._rates:
+            return TOO_HIGH
+        self._set(self._new[0], self._rates[data[0]])
+        return data[:1]
+
+    def set_id(self, data: bytes) -> Answer:
+        if data[0] == BROADCAST:
+            return TOO_LOW
+        self._set(data[0], self._new[1])
+        return data[:1]
+
+    def save(self, data: bytes) -> Answer:
+        if data[: len(SAVE_WORD)] != SAVE_WORD:
+            return None
+        self._stored = self._new
+        return b"" if self.answers_save else None
+
+    def read_id(self, data: bytes) -> Answer:
+        return bytes((self.node,))
+
+    def set_position(self, data: bytes) -> Answer:
+        steps = decode_position(data)
+        if not self.model.range[0] <= steps <= self.model.range[1]:
+            return OUT_OF_RANGE
+        self.goal = float(steps)
+        return data[:2]
+
+    def read_position(self, data: bytes) -> Answer:
+        return encode_position(round(self.goal if self.reads_goal else self.position))
+
+    def read_status(self, data: bytes) -> Answer:
+        return self.status_bytes
+
+    def read_version(self, data: bytes) -> Answer:
+        return self.firmware
+
+    def _set(self, servo_id: int, baudrate: int) -> None:
+        self._new = servo_id, baudrate
+        if self.immediate:
+            self._adopt()
+
+    def _adopt(self) -> None:
+        self.node, self.baudrate = self._new
+
+    def _reply(self, address: int, command: int, answer: bytes | int) -> bytes:
+        if isinstance(answer, bytes):
+            return encode(address, REPLY + command, answer, self.version)
+        code = answer.to_bytes(4, "little" if self.sdo_order == "le" else "big")
+        return encode(address, REFUSED + command, code, self.version)
+
+
+VERBS: dict[int, Callable[[KstDevice, bytes], Answer]] = {
+    Command.SET_BAUD: KstDevice.set_baud,
+    Command.SET_ID: KstDevice.set_id,
+    Command.SAVE: KstDevice.save,
+    Command.READ_ID: KstDevice.read_id,
+    Command.SET_POSITION: KstDevice.set_position,
+    Command.READ_POSITION: KstDevice.read_position,
+    Command.READ_STATUS: KstDevice.read_status,
+    Command.READ_VERSION: KstDevice.read_version,
+}
+
+
+def devices(options: KstBus, models: Mapping[str, KstModel]) -> list[KstDevice]:
+    """The servos of a bus, each standing at its zero."""
+    found = []
+    for servo in options.servos.values():
+        model = models[servo.model]
+        device = KstDevice(
+            model,
+            servo.id,
+            baudrate=options.baudrate,
+            position=round(model.zero if servo.zero is None else servo.zero),
+            baud_table=options.baud_table,
+            version=options.version_byte,
+            immediate=options.id_effective == "immediate",
+        )
+        device.sdo_order = "le" if options.sdo_order == "le" else "be"
+        device.answers_save = options.save_reply == "required"
+        device.answers_broadcasts = options.broadcast_reply == "expect_one"
+        found.append(device)
+    return found

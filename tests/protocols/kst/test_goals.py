@@ -1,0 +1,195 @@
+"""Goals as addressed frames that are confirmed, and how everything comes to rest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from servobus.errors import EchoMismatch, ReplyTimeout
+from servobus.protocols.words import Outcome, StopReport, StopTarget
+from servobus.protocols.kst.aborts import HardwareFault, OutOfRange
+from servobus.protocols.kst.codec import Command, encode, encode_position
+from servobus.protocols.kst.goals import HOLDS
+from tests.protocols.kst.simulated import Bench, changed_model, goal
+
+
+def position_frame(node: int, steps: int) -> bytes:
+    return encode(node, Command.SET_POSITION, encode_position(steps))
+
+
+def move(bench: Bench, *, together: bool = False, confirm: bool = False, **goals: float) -> dict[str, Any]:
+    wanted = [goal(name, value) for name, value in goals.items()]
+    results: dict[str, Any] = {}
+    for turn in bench.driver.plan(wanted, together=together, confirm=confirm):
+        results |= bench.run(turn.plan)
+    return results
+
+
+def enabled(**keys: Any) -> Bench:
+    bench = Bench(**keys)
+    for name in bench.driver.servos:
+        bench.run(bench.driver.enable(name))
+    bench.frames()
+    return bench
+
+
+def target(servo: str, kind: str = "hold", **keys: Any) -> StopTarget:
+    return StopTarget(servo, kind, **{"enabled": True, **keys})  # type: ignore[arg-type]
+
+
+def test_each_goal_has_a_turn_of_its_own() -> None:
+    bench = enabled()
+    turns = bench.driver.plan([goal("pan", 10), goal("tilt", -10.9)], together=False, confirm=False)
+    assert [(turn.servos, turn.frames) for turn in turns] == [(("pan",), 1), (("tilt",), 1)]
+    for turn in turns:
+        assert set(bench.run(turn.plan).values()) == {Outcome.ACKED}
+    assert bench.frames() == [position_frame(1, 100), position_frame(2, -109)]
+
+
+@pytest.mark.parametrize("confirm", [True, False])
+def test_together_is_one_uninterrupted_plan(confirm: bool) -> None:
+    bench = enabled()
+    (turn,) = bench.driver.plan([goal("pan", 10), goal("tilt", -10)], together=True, confirm=confirm)
+    assert (turn.servos, turn.frames) == (("pan", "tilt"), 2)
+    assert bench.run(turn.plan) == {"pan": Outcome.ACKED, "tilt": Outcome.ACKED}
+    assert bench.driver.plan([], together=True, confirm=False) == []
+
+
+def test_what_one_servo_refuses_does_not_keep_the_others() -> None:
+    bench = enabled()
+    bench.devices[0].refuses = {Command.SET_POSITION: 0x06090030}
+    results = move(bench, together=True, pan=10, tilt=20)
+    assert isinstance(results["pan"], OutOfRange)
+    assert results["pan"].servo == "pan"
+    assert results["tilt"] is Outcome.ACKED
+    assert bench.driver.servos["pan"].setpoint is None
+
+
+def test_the_servo_goes_there_at_its_own_speed() -> None:
+    bench = enabled(model=changed_model(max_steps_per_second=1000.0))
+    move(bench, pan=90)
+    read = bench.driver.read_register("pan", "position")
+    bench.exchange(read)
+    assert bench.after(0.3).exchange(read) == pytest.approx(30)
+    assert bench.after(5).exchange(read) == 90
+
+
+def test_a_goal_without_answer_is_said_again_and_then_given_up_as_perhaps_obeyed() -> None:
+    bench = enabled()
+    bench.loses = lambda request: True
+    assert isinstance(move(bench, pan=10)["pan"], ReplyTimeout)
+    assert bench.frames() == [position_frame(1, 100)] * 3
+    servo = bench.driver.servos["pan"]
+    assert servo.setpoint is None
+    servo.seen(100)
+    assert not servo.jumped
+
+
+def test_a_wrong_echo_fails_the_goal() -> None:
+    """K12."""
+    bench = enabled()
+    bench.devices[0].says = {Command.SET_POSITION: encode_position(1)}
+    assert isinstance(move(bench, pan=10)["pan"], EchoMismatch)
+    lenient = enabled(echo_check="off")
+    lenient.devices[0].says = {Command.SET_POSITION: encode_position(1)}
+    assert move(lenient, pan=10)["pan"] is Outcome.ACKED
+
+
+def test_a_hardware_fault_latches_until_the_servo_is_enabled_again() -> None:
+    bench = enabled()
+    bench.devices[0].refuses = {Command.SET_POSITION: 0x06060000}
+    assert isinstance(move(bench, pan=10)["pan"], HardwareFault)
+    bench.devices[0].refuses = {}
+    bench.frames()
+    assert "nothing was sent" in str(move(bench, pan=10)["pan"])
+    assert bench.frames() == []
+    assert move(bench, tilt=10)["tilt"] is Outcome.ACKED
+    with pytest.raises(HardwareFault, match="enable it again"):
+        bench.driver.check_goal(goal("pan", 10))
+    assert bench.driver.fault_names("pan", None) == ("hardware fault",)
+    bench.run(bench.driver.enable("pan"))
+    assert move(bench, pan=10)["pan"] is Outcome.ACKED
+
+
+# Stops
+
+
+def test_a_stop_says_the_last_confirmed_setpoint_once_more() -> None:
+    """K20, K23: what a read brings may be the goal itself."""
+    bench = enabled()
+    move(bench, pan=10)
+    bench.frames()
+    reports = bench.run(bench.driver.stop([target("pan"), target("tilt")]))
+    assert reports == {"pan": StopReport("hold", True, True), "tilt": StopReport("hold", True, True)}
+    assert bench.frames() == [position_frame(1, 100), position_frame(2, 0)]
+
+
+def test_what_was_not_enabled_is_left_alone() -> None:
+    bench = Bench()
+    reports = bench.run(bench.driver.stop([target("pan", enabled=False)]))
+    assert (reports["pan"].action, reports["pan"].written, reports["pan"].confirmed) == ("none", False, True)
+    assert bench.frames() == []
+
+
+def test_limp_is_a_hold_that_says_so() -> None:
+    bench = enabled()
+    move(bench, pan=-20)
+    bench.frames()
+    assert bench.run(bench.driver.stop([target("pan", "limp")])) == {"pan": StopReport("hold", True, True, HOLDS)}
+    assert bench.frames() == [position_frame(1, -200)]
+
+
+def test_a_servo_that_does_not_answer_is_told_twice_more_after_all_others() -> None:
+    bench = enabled()
+    bench.loses = lambda request: request.node == 1
+    reports = bench.run(bench.driver.stop([target("pan"), target("tilt")]))
+    assert list(reports) == ["pan", "tilt"]
+    assert (reports["pan"].written, reports["pan"].confirmed) == (True, False)
+    assert "no answer" in reports["pan"].detail
+    assert reports["tilt"].confirmed
+    assert bench.frames() == [*[position_frame(1, 0)] * 3, position_frame(2, 0), *[position_frame(1, 0)] * 2]
+
+
+def test_an_offline_servo_is_written_to_and_not_waited_for() -> None:
+    bench = enabled()
+    reports = bench.run(bench.driver.stop([target("pan", reachable=False), target("tilt")]))
+    assert reports["pan"] == StopReport("hold", True, False, "offline: nothing was confirmed")
+    assert [(request.node, request.replies) for request in bench.said] == [(2, 1), (1, 0), (1, 0)]
+
+
+def test_where_nothing_is_known_the_position_is_asked_for() -> None:
+    bench = Bench()
+    bench.devices[0].position = bench.devices[0].goal = 333
+    assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed
+    assert bench.frames() == [encode(1, Command.READ_POSITION), position_frame(1, 333)]
+    reports = Bench().run(bench.driver.stop([target("tilt", reachable=False)]))
+    assert (reports["tilt"].written, reports["tilt"].confirmed) == (False, False)
+    assert "its position is not known" in reports["tilt"].detail
+
+
+def test_a_servo_that_has_restarted_is_not_sent_back() -> None:
+    """K21."""
+    bench = enabled()
+    move(bench, pan=80)
+    bench.after(1.0).exchange(bench.driver.read_state("pan"))
+    bench.devices[0].reboot(1.0)
+    bench.after(1.0).exchange(bench.driver.read_state("pan"))
+    bench.exchange(bench.driver.read_state("pan"))
+    bench.frames()
+    bench.run(bench.driver.stop([target("pan")]))
+    (frame,) = bench.frames()
+    assert frame == position_frame(1, round(bench.devices[0].position))
+
+
+def test_a_latched_fault_does_not_keep_a_stop_back() -> None:
+    bench = enabled()
+    bench.driver.wire.aborts.faulty.add(1)
+    assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed
+
+
+def test_disable_closes_the_gate_and_says_nothing() -> None:
+    """K20."""
+    bench = enabled()
+    assert bench.run(bench.driver.disable("pan")) == StopReport("hold", False, True, HOLDS)
+    assert bench.frames() == []
