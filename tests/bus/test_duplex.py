@@ -148,7 +148,7 @@ async def test_a_lost_line_ends_every_turn_in_flight() -> None:
 
 @virtual
 async def test_a_plan_waits_until_the_line_is_empty_and_has_it_alone() -> None:
-    async with open_rig(config("full")) as rig:
+    async with open_rig(config("full", delays="[0.2, 0.2]")) as rig:
         reading = [asyncio.create_task(rig.read_register(f"k{number}", "position")) for number in range(1, SERVOS + 1)]
         await asyncio.sleep(0)
         identities = await asyncio.gather(*(rig.identify(f"k{number}") for number in (1, 2, 3)))
