@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from servobus.config import Config
 from servobus.errors import ServobusError
 from servobus.local import LocalRig, open_rig
 from servobus.protocols.words import Outcome
@@ -65,6 +66,33 @@ VERBS: dict[str, Verb] = {
     "clear": (lambda rig: rig.clear(), lambda done: done is None),
 }
 
+KST_VERBS: dict[str, Verb] = {
+    **{name: VERBS[name] for name in ("read", "write", "settle", "stop", "clear")},
+    "ping": (lambda rig: rig.ping("s1"), lambda status: status is None),
+    "identify": (lambda rig: rig.identify("s2"), lambda found: (found.model, found.firmware) == ("kst", "1.00")),
+    "read_register": (lambda rig: rig.read_register("s2", "id"), lambda value: value == 2),
+    "scan": (lambda rig: rig.scan("arm", ids=range(1, 5)), lambda found: [hit.id for hit in found] == [1, 2, 3]),
+    "enable": VERBS["enable"],
+    "sync_write": (lambda rig: rig.move({"s1": 5, "s2": -5}), lambda results: set(results.values()) == {Outcome.ACKED}),
+    "reg_write": VERBS["reg_write"],
+}
+KST_ORDER = (
+    "ping",
+    "identify",
+    "read",
+    "read_register",
+    "scan",
+    "enable",
+    "write",
+    "sync_write",
+    "reg_write",
+    "settle",
+    "stop",
+    "clear",
+)
+KST_SERVOS = ("s1: {id: 1, limits: [-80, 80]}", "s2: {id: 2}", "s3: {id: 3}")
+PROTOCOLS = {"sms": VERBS, "kst": {name: KST_VERBS[name] for name in KST_ORDER}}
+
 LOSSY: dict[str, Callable[[Any], bool]] = {
     "scan": lambda found: {hit.id for hit in found} <= {1, 2, 3},
     "sync_write": lambda results: set(results.values()) <= {Outcome.SENT, Outcome.ACKED},
@@ -73,9 +101,14 @@ LOSSY: dict[str, Callable[[Any], bool]] = {
 """What is right all the same where replies are lost: ids not found, goals that leave one by one, an older goal reached."""
 
 
-async def _every_verb(rig: LocalRig, delivery: Delivery) -> None:
+def _config(protocol: str, delivery: Delivery) -> Config:
+    keys = {"faults": delivery.faults, "echo": delivery.echo, "poll": "{feedback: 50}"}
+    return config(**keys) if protocol == "sms" else config(*KST_SERVOS, protocol="kst", baudrate="512000", **keys)
+
+
+async def _every_verb(rig: LocalRig, protocol: str, delivery: Delivery) -> None:
     ended = {}
-    for name, (verb, right) in VERBS.items():
+    for name, (verb, right) in PROTOCOLS[protocol].items():
         async with asyncio.timeout(30):
             try:
                 result = await verb(rig)
@@ -91,16 +124,16 @@ async def _every_verb(rig: LocalRig, delivery: Delivery) -> None:
     assert sum(ended.values()) > len(ended) / 2, ended
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", MATRIX)
 @virtual
-async def test_in_memory(kind: str) -> None:
-    delivery = MATRIX[kind]
-    async with open_rig(config(faults=delivery.faults, echo=delivery.echo, poll="{feedback: 50}")) as rig:
-        await _every_verb(rig, delivery)
+async def test_in_memory(kind: str, protocol: str) -> None:
+    async with open_rig(_config(protocol, MATRIX[kind])) as rig:
+        await _every_verb(rig, protocol, MATRIX[kind])
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", MATRIX)
-async def test_on_a_pty(kind: str) -> None:
-    delivery = MATRIX[kind]
-    async with pty_rig(config(faults=delivery.faults, echo=delivery.echo, poll="{feedback: 50}")) as rig:
-        await _every_verb(rig, delivery)
+async def test_on_a_pty(kind: str, protocol: str) -> None:
+    async with pty_rig(_config(protocol, MATRIX[kind])) as rig:
+        await _every_verb(rig, protocol, MATRIX[kind])
