@@ -8,11 +8,11 @@ none of it touches another bus. Nothing is written at start; at the end every se
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import anyio
 import structlog
@@ -20,15 +20,16 @@ import structlog
 from servobus.bus.scan import scan
 from servobus.bus.service import BusService
 from servobus.config import Config, load_config
-from servobus.errors import EStopped, LinkDown, UnknownName
+from servobus.errors import EStopped, LimitError, LinkDown, UnknownName
 from servobus.links import open_link
 from servobus.links.base import Link
 from servobus.protocols.options import BusOptions
 from servobus.protocols.table import PROTOCOLS
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
-from servobus.rig import Found, Rig, Snapshot, outcomes, raise_failures
+from servobus.rig import Found, Rig, Snapshot, outcomes, raise_failures, uncancelled
 from servobus.sim.build import SimLink, simulated_link
 
+R = TypeVar("R")
 Trace = Callable[[str, bool, bytes, float], None]
 """(bus, sent, bytes, monotonic seconds) of everything on the wire."""
 
@@ -52,7 +53,7 @@ class LocalRig(Rig):
         self._names = {name: place for name, place in config.names.items() if not only or place[0] in only}
         self._tried: dict[str, asyncio.Event] = {}
         self._down: dict[str, LinkDown] = {}
-        self._parking: set[asyncio.Task[StopReport]] = set()
+        self._stopping: set[asyncio.Task[Any]] = set()
         for name in only or config.buses:
             self._add(name, config.buses[name])
             if trace is not None:
@@ -113,13 +114,14 @@ class LocalRig(Rig):
 
     async def leave(self) -> None:
         """Exit policies, on all buses at once: park first where a servo says so. `left` tells what became of each servo."""
+        await asyncio.gather(*self._stopping)
         for bus in self.buses.values():
+            bus.motion.leaving = True
             for record in bus.motion.to_leave():
                 self.left[f"{bus.name}/{record.name}"] = StopReport(record.options.on_exit, False, False, "no answer in time")
-        parking = self._enabled("on_exit", "park")
+        parking = [] if self.stopped else self._enabled("on_exit", "park")  # what the e-stop holds stays
         reports = await asyncio.gather(*(self._park(bus, servo) for bus, servo in parking))
         self.left.update({f"{bus.name}/{servo}": report for (bus, servo), report in zip(parking, reports, strict=True)})
-        await asyncio.gather(*self._parking)
         await asyncio.gather(*(self._leave(bus) for bus in self.buses.values()))
         for name, report in self.left.items():
             if not report.confirmed and report.action != "park":  # that has its own event
@@ -143,7 +145,9 @@ class LocalRig(Rig):
         parts: dict[BusService, dict[str, Goal]] = {}
         for name, goal in goals.items():
             bus, servo = self.bus_of(name)
-            parts.setdefault(bus, {})[servo] = goal
+            if servo in parts.setdefault(bus, {}):
+                raise LimitError(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
+            parts[bus][servo] = goal
         checked = {bus: bus.motion.check(part) for bus, part in parts.items()}
         futures = {
             f"{bus.name}/{servo}": future
@@ -159,20 +163,28 @@ class LocalRig(Rig):
         await self._each(names, lambda bus, servo: bus.motion.disable(servo))
 
     async def stop(self) -> dict[str, StopReport]:
+        stopping = self._track(self._stop_all())
+        return await asyncio.shield(stopping)  # a caller that leaves does not end it
+
+    async def _stop_all(self) -> dict[str, StopReport]:
         self._event("estop")
         parking = self._enabled("on_estop", "park")
         reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
         for bus, servo in parking:
-            task = asyncio.create_task(self._park(bus, servo))
-            self._parking.add(task)
-            task.add_done_callback(self._parking.discard)
+            self._track(self._park(bus, servo))
         return {
             f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
         }
 
+    def _track(self, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
+        task = asyncio.create_task(work)
+        self._stopping.add(task)
+        task.add_done_callback(self._stopping.discard)
+        return task
+
     async def clear(self) -> None:
-        if self._parking:
-            raise EStopped("servos are still being parked: clear when they stand")
+        if self._stopping:
+            raise EStopped("servos are still being stopped or parked: clear when they stand")
         for bus in self.buses.values():
             bus.motion.latched = False
         self._event("estop_cleared")
@@ -290,10 +302,8 @@ async def open_rig(
             yield rig
         except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
             failure = error
-        with anyio.CancelScope(shield=True):
-            await rig.leave()
+        cancelled = await uncancelled(rig.leave())
         keepers.cancel_scope.cancel()
-    with anyio.CancelScope(shield=True):
-        await rig.close()
-    if failure is not None:
-        raise failure
+    cancelled = await uncancelled(rig.close()) or cancelled
+    if failure or cancelled:
+        raise failure or cancelled  # type: ignore[misc]

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import anyio
 
 from servobus.errors import PartialFailure, ServobusError, UnknownName
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
@@ -52,6 +54,20 @@ async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, 
     named = dict(zip(futures, results, strict=True))
     raise_failures(named)
     return {name: result for name, result in named.items() if isinstance(result, Outcome)}
+
+
+async def uncancelled(work: Coroutine[Any, Any, None]) -> asyncio.CancelledError | None:
+    """Do it to its end, whoever cancels us meanwhile; returns the cancellation, to be raised when all is done."""
+    task, cancelled = asyncio.ensure_future(work), None
+    with anyio.CancelScope(shield=True):
+        while not task.done():
+            try:
+                await asyncio.shield(task)
+            except asyncio.CancelledError as error:
+                if not task.done():
+                    cancelled = error
+    task.result()
+    return cancelled
 
 
 def raise_failures(results: Mapping[str, Any]) -> None:

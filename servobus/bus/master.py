@@ -121,6 +121,7 @@ class BusMaster(asyncio.Protocol):
         self._transport = None
         flight, self._flight = self._flight, []
         self._wake.cancel()
+        self._health.suspect_all()
         self._counts["line_lost"] += exc is not None
         self.runner.lost(str(exc) if exc else "closed", flight)
         if not self._closed.done():
@@ -137,7 +138,7 @@ class BusMaster(asyncio.Protocol):
             if not data:
                 return
         flight = self._flight
-        if not flight or (line.traits.paced and now < flight[0].sent_by):
+        if not flight or (line.traits.paced and self._is_early(len(data), now, flight[0])):
             self._unsolicited(data, now)
             return
         self._codec.receive_data(data)
@@ -153,6 +154,11 @@ class BusMaster(asyncio.Protocol):
             self._counts["rejected_windows"] += 1
             self._missed(turn, now)
 
+    def _is_early(self, size: int, now: float, turn: Turn) -> bool:
+        """Bytes take their time, so the first of these was on the wire before the question had left."""
+        least = (min(size, turn.request.reply_size) - 0.5) * self.line.traits.byte_time
+        return not (turn.replies or self._codec.pending) and now - least < turn.sent_by
+
     def _unsolicited(self, data: bytes, now: float) -> None:
         """Nobody asked, or the question has not left yet: never an answer. The line is listened out before the next word."""
         self._counts["unsolicited_bytes"] += len(data)
@@ -161,6 +167,7 @@ class BusMaster(asyncio.Protocol):
         while (reply := self._codec.next_reply()) is not None:
             strays.append(reply)
         self.runner.strays(strays, None, now)
+        self._codec.reset()  # the rest of them is no beginning of an answer
         if not self._flight:
             self.line.listen_out(now)
             self._pump()  # who spoke is to be asked again, when it is quiet

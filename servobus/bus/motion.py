@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -28,7 +29,7 @@ LEAST_TTL = 0.2
 """Seconds a goal may wait for its first byte, unless two learned turns take longer."""
 FRESH = 0.1
 """Seconds for which a position is good enough to be held at once by an e-stop."""
-STOP_PATIENCE = 2.0
+SESSION = "a scan or commissioning session has this bus: wait until it ends"
 SETTLE_PERIOD = 0.02
 _batches = itertools.count(1)
 
@@ -40,6 +41,10 @@ class Motion:
         self._bus = bus
         self.latched = False
         """The e-stop holds: motion and enable are refused until it is cleared."""
+        self.leaving = False
+        """The rig is being left: nothing new is begun."""
+        self.enabling: set[str] = set()
+        """Servos that are being enabled just now."""
 
     def check(self, goals: Mapping[str, Goal]) -> dict[str, Goal]:
         """The goals to send, clamped where a servo says so. Raises what refuses any of them; nothing is sent."""
@@ -112,24 +117,35 @@ class Motion:
     async def enable(self, servo: str) -> None:
         self.refuse()
         record = self._bus.records[servo]
-        if record.identity is None:
-            await self._bus.identify(servo)
-        self._set_enabled(record, False)
-        record.touched = True  # also when this is cancelled or fails half-way
-        present = await self._bus.perform(self._bus.driver.enable(servo), record.node.id, servo=servo, motion=True)
-        if self.latched:
+        generation = record.generation
+        self.enabling.add(servo)
+        try:
+            if record.identity is None:
+                await self._bus.identify(servo)
+                self.refuse()
+            self._set_enabled(record, False)
+            record.touched = True  # also when this is cancelled or fails half-way
+            present = await self._bus.perform(self._bus.driver.enable(servo), record.node.id, servo=servo, motion=True)
+        finally:
+            self.enabling.discard(servo)
+        if self.latched or self.leaving:
             raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
+        if record.generation != generation:
+            raise NotEnabled("it was disabled while it was being enabled", bus=self._bus.name, servo=servo)
         record.setpoint = present
         self._bus.scheduler.profile.forget(servo)
         self._set_enabled(record, True)
 
     async def disable(self, servo: str) -> None:
         record = self._bus.records[servo]
+        if self._bus.scheduler.session is not None:
+            raise LeaseHeld(SESSION, bus=self._bus.name, servo=servo)
         self._bus.scheduler.drop_goals(self._disabled, {servo})
-        self._set_enabled(record, False)
+        self._disable(record)
         report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
         if not report.confirmed:
             raise DeviceError(f"torque off was written and not confirmed: {report.detail}", bus=self._bus.name, servo=servo)
+        self._disable(record)
         record.touched = False
 
     async def stop(self) -> dict[str, StopReport]:
@@ -141,8 +157,10 @@ class Motion:
         """Torque off for these, ahead of everything."""
         return await self._stop(lambda _: "limp", [self._bus.records[servo] for servo in servos])
 
-    async def _stop(self, kind_of: Callable[[ServoRecord], str], records: Sequence[ServoRecord]) -> dict[str, StopReport]:
+    async def _stop(self, kind_of: Callable[[ServoRecord], str], servos: Sequence[ServoRecord]) -> dict[str, StopReport]:
         now = self._bus.clock()
+        # Those that answer come first: a dead one must not hold up a live one.
+        records = sorted(servos, key=lambda record: record.node.condition is not Condition.ONLINE)
         targets = [
             StopTarget(
                 record.name,
@@ -156,26 +174,36 @@ class Motion:
         if not targets:
             return {}
         future: asyncio.Future[dict[str, StopReport]] = self._bus.loop.create_future()
-        job = Job(future, now + STOP_PATIENCE, plan=self._bus.driver.stop(targets), node=records[0].node.id)
+        job = Job(future, math.inf, plan=self._bus.driver.stop(targets), node=records[0].node.id, tries=1)
+        for record, target in zip(records, targets, strict=True):
+            record.setpoint = None
+            if target.kind == "limp":
+                self._disable(record)  # before anything is said: no goal may leave behind the torque off
         try:
             self._bus.master.submit_estop(job)
             reports = await future
         except ServobusError as error:
-            job.fail(error)
+            if not future.done():
+                job.fail(error)
+                future.exception()
             reports = {target.servo: StopReport(target.kind, False, False, str(error)) for target in targets}
         for record, target in zip(records, targets, strict=True):
-            record.setpoint = None
             if target.kind == "limp":
-                self._set_enabled(record, False)
                 record.touched = record.touched and not reports[record.name].confirmed
-        return reports
+        return {record.name: reports[record.name] for record in servos}
 
-    async def settle(self, servo: str, *, tolerance: float | None, timeout: float) -> State:
-        """Until it stands at its setpoint. Raises DeviceError with where it stands."""
+    async def settle(self, servo: str, *, tolerance: float | None, timeout: float, parking: bool = False) -> State:
+        """Until it stands at its setpoint. Raises DeviceError with where it stands, EStopped and NotEnabled when it will not get
+        there any more."""
         bus, record = self._bus, self._bus.records[servo]
+        moving = record.enabled
         near = bus.tolerance(servo) if tolerance is None else tolerance
         end = bus.clock() + timeout
         while True:
+            if self.latched and not parking:
+                raise EStopped("the e-stop came before it stood at its goal", bus=bus.name, servo=servo)
+            if moving and not record.enabled:
+                raise NotEnabled("it was disabled, or has restarted, before it stood at its goal", bus=bus.name, servo=servo)
             state = await bus.read(servo, SETTLE_PERIOD)
             there = record.setpoint is None or (state.position is not None and abs(state.position - record.setpoint) <= near)
             if there and not state.moving and not bus.scheduler.profile.leads(servo):
@@ -190,13 +218,18 @@ class Motion:
 
     async def park(self, servo: str) -> StopReport:
         """To the park pose within `park_timeout`, then limp, even if it does not get there. The e-stop it serves lets it pass."""
-        options = self._bus.records[servo].options
+        record = self._bus.records[servo]
+        options = record.options
         detail = ""
         try:
+            # Whether it still is as we left it: one that has restarted is limp, and must not be moved.
+            await self._bus.perform(self._bus.scheduler.recovery(record.node), record.node.id, servo=servo, urgent=True)
+            if not record.enabled:
+                return StopReport("none", False, True, "it was disabled, or has restarted")
             assert options.park_pose is not None
             goal = Goal("position", options.park_pose)
             await self.put({servo: goal}, together=False, confirm=False)[servo]
-            await self.settle(servo, tolerance=None, timeout=options.park_timeout)
+            await self.settle(servo, tolerance=None, timeout=options.park_timeout, parking=True)
         except ServobusError as error:
             detail = f"not at its park pose: {error.message}"
         report = (await self.limp([servo]))[servo]
@@ -207,7 +240,9 @@ class Motion:
         if self.latched:
             raise EStopped("the e-stop is latched: `clear` releases it", bus=self._bus.name)
         if self._bus.scheduler.session is not None:
-            raise LeaseHeld("a scan or commissioning session has this bus: motion waits until it ends", bus=self._bus.name)
+            raise LeaseHeld(SESSION, bus=self._bus.name)
+        if self.leaving:
+            raise NotEnabled("the rig is being left: its servos stop as their on_exit says, nothing was sent", bus=self._bus.name)
 
     def disable_restarted(self, node: Node) -> list[ServoRecord]:
         """The node has lost what enable() wrote: its servos that were enabled, now disabled."""
@@ -225,6 +260,10 @@ class Motion:
     def to_leave(self) -> list[ServoRecord]:
         """The servos whose torque may be on because of us."""
         return [record for record in self._bus.records.values() if record.touched]
+
+    def _disable(self, record: ServoRecord) -> None:
+        record.generation += 1
+        self._set_enabled(record, False)
 
     def _set_enabled(self, record: ServoRecord, enabled: bool) -> None:
         record.enabled = enabled

@@ -15,6 +15,7 @@ class ServoRecord:
     __slots__ = (
         "_fields",
         "enabled",
+        "generation",
         "identity",
         "introduce_after",
         "name",
@@ -31,6 +32,8 @@ class ServoRecord:
         self.options = options
         self.node = node
         self.enabled = False
+        self.generation = 0
+        """Counts what ends an enable that is under way: disable, limp."""
         self.touched = False
         """We may have switched its torque on, even if enable() did not come through: at the end it is left as `on_exit` says."""
         self.identity: Identity | None = None

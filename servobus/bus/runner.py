@@ -126,7 +126,7 @@ class Runner:
                 self.health.node(reply.node).answered(reply.status, now)
             self._conclude(turn)
         else:
-            self._again(turn)
+            self._again(turn, now)
 
     def babbled(self) -> None:
         """The line never falls quiet: the plan under way ends, and only an e-stop is still said."""
@@ -170,13 +170,14 @@ class Runner:
         assert run is not None
         return run
 
-    def _again(self, turn: Turn) -> None:
+    def _again(self, turn: Turn, now: float) -> None:
         """Say it once more, or give it up."""
         run, request = self._run_of(turn), turn.request
         run.attempts += 1
         offline = any(self.health.node(node).condition is Condition.OFFLINE for node in request.nodes)
         # A recovery is never repeated in the middle: what it asked may still be answered, and must be fenced again.
-        if not request.idempotent or run.recovering or run.attempts >= run.job.tries or offline:
+        stale = run.job.motion and now >= run.job.expires  # a goal is not said again after its time
+        if not request.idempotent or run.recovering or stale or run.attempts >= run.job.tries or offline:
             self._fail(run, self._timeout(run.attempts, request), offline=offline)
             return
         self.stats.counts["retries"] += 1

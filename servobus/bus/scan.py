@@ -36,10 +36,19 @@ async def scan(
 
 
 async def _look(bus: BusService, node: int, rate: int, session: object) -> Hit | None:
+    question = bus.driver.ping(node)
+    echoes = bus.stats.counts["echoes"]
     try:
-        await bus.ask(bus.driver.ping(node), urgent=True, session=session, tries=1)
+        await bus.ask(question, urgent=True, session=session, tries=1)
     except ReplyTimeout:
-        return None
+        plain = question.plain()
+        if plain is None or bus.stats.counts["echoes"] == echoes:
+            return None
+        # What came looked like the question: an echo, or a servo whose fault makes its answer look so. Ask so that they differ.
+        try:
+            await bus.ask(plain, urgent=True, session=session, tries=1)
+        except ReplyTimeout:
+            return None
     try:
         seen = await bus.perform(bus.driver.inspect(node), node, urgent=True, session=session)
     except (ReplyTimeout, DeviceError):

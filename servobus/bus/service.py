@@ -78,6 +78,8 @@ class BusService:
         if self.options.echo == "auto":
             await self._probe_echo()
         await asyncio.gather(*(self._introduce(record) for record in self.records.values()))
+        if self.master.up and self.motion.latched:
+            await self.motion.stop()  # asked for while the line was down
         if self.master.up:
             self.scheduler.polls.set(self.driver.polls(self.options.poll.rates()), self.clock())
             self.master.goals_waiting()
@@ -216,7 +218,7 @@ class BusService:
     async def exclusive(self) -> AsyncIterator[object]:
         """Polls, probes and goals rest, motion is refused, other requests wait. Raises LeaseHeld when one is open already."""
         self.motion.refuse()
-        moving = [record.name for record in self.records.values() if record.enabled]
+        moving = [name for name, record in self.records.items() if record.enabled or name in self.motion.enabling]
         if moving:
             raise LeaseHeld(f"{', '.join(moving)} {'is' if len(moving) == 1 else 'are'} enabled: disable first", bus=self.name)
         self.scheduler.session = session = object()

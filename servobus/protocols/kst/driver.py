@@ -13,7 +13,6 @@ from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
-from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
 from servobus.protocols.kst.commission import Commissioning
@@ -21,6 +20,7 @@ from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
 from servobus.protocols.kst.requests import Fence, Read, Wire
 from servobus.protocols.kst.servo import FittedServo
+from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
 
 FENCES = (Command.READ_ID, Command.READ_VERSION, Command.READ_STATUS, Command.READ_POSITION)
 """The reads there are; a fence is one whose reply is not under way. The first names the servo in its data too."""
@@ -178,7 +178,7 @@ class KstDriver:
         self.pace(goal)
 
     def pace(self, goal: ServoGoal) -> float | None:
-        """The goal's own speed, else the servo's, else its greatest, else the model's: a servo left alone goes as fast as it can."""
+        """The goal's own speed, else the servo's, else its greatest, else the model's: left alone it goes as fast as it can."""
         servo, wanted = self.servos[goal.servo], goal.goal
         if wanted.speed == 0:
             return None

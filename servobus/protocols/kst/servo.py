@@ -8,10 +8,10 @@ position. What can be seen of one: the servo stands where nobody sent it.
 from __future__ import annotations
 
 from servobus.errors import DeviceError, LimitError
-from servobus.protocols.words import Update
 from servobus.protocols.kst.codec import decode_position
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstServo
+from servobus.protocols.words import Update
 
 JUMP_DEG = 5.0
 """How far off its way a servo may be before it must have restarted: more than load and overshoot explain."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Hashable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
-from servobus.protocols.sms.identity import identify, inspect
+from servobus.protocols.sms.identity import identify, inspect, learn_mode
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Fence, Ping, Read, SyncRead, Write
@@ -216,8 +217,12 @@ class SmsDriver:
     def _write_eeprom(self, servo: FittedServo, register: Register, data: bytes) -> Plan[None]:
         """Unlock, write, lock again whatever happened (seed 1.3.3: unlocked, or the value is lost at power-off)."""
         lock = servo.model.registers[servo.model.lock].address
-        yield from ask(Write(servo.node, lock, b"\x00", answered=self.acknowledged))
+        if (yield from ask(self._read(servo, servo.model.registers[servo.model.torque]))):
+            raise NotSupported(
+                "its torque is on, and EEPROM is written to servos at rest only: disable it first", servo=servo.name
+            )
         try:
+            yield from ask(Write(servo.node, lock, b"\x00", answered=self.acknowledged))
             yield from ask(Write(servo.node, register.address, data, answered=self.acknowledged))
         except ServobusError:
             yield from ask(Write(servo.node, lock, b"\x01", answered=self.acknowledged))
@@ -227,8 +232,18 @@ class SmsDriver:
     # Motion
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Sentinel and limits, goal := present, torque on, all read back."""
+        """Mode, sentinel and limits, goal := present, torque on, all read back. What fails half-way ends with torque off."""
         fitted = self.servos[servo]
+        yield from learn_mode(fitted)
+        try:
+            return (yield from self._energise(fitted))
+        except ServobusError:
+            torque = fitted.model.registers[fitted.model.torque]
+            with suppress(ServobusError):
+                yield from ask(Write(fitted.node, torque.address, b"\x00", answered=self.acknowledged))
+            raise
+
+    def _energise(self, fitted: FittedServo) -> Plan[float | None]:
         model = fitted.model
         fitted.extras.clear()
         for name, count in fitted.extras_for(None, None).items():
@@ -242,7 +257,7 @@ class SmsDriver:
         torque = model.registers[model.torque]
         yield from ask(Write(fitted.node, torque.address, b"\x01", answered=self.acknowledged))
         if (yield from ask(self._read(fitted, register))) != goal or not (yield from ask(self._read(fitted, torque))):
-            raise DeviceError("the servo did not take its present position as goal: it stays disabled", servo=servo)
+            raise DeviceError("the servo did not take its present position as goal: it stays disabled", servo=fitted.name)
         return fitted.calibration.to_unit(present) if fitted.mode == "position" else None
 
     @staticmethod

@@ -41,7 +41,7 @@ class GoalWriter:
     """Plans the turns of goals. Remembers between turns which nodes may hold a REG WRITE nobody acknowledged."""
 
     options: SmsBus
-    maybe_armed: set[int] = field(default_factory=set)
+    maybe_armed: dict[int, FittedServo] = field(default_factory=dict)
 
     def plan(self, goals: Sequence[tuple[FittedServo, ServoGoal]], *, together: bool, confirm: bool) -> list[GoalTurn]:
         parts = [Part(servo, *servo.goal_span(goal), servo.changed_extras(goal)) for servo, goal in goals]
@@ -97,8 +97,9 @@ class GoalWriter:
                 )
 
     def _reg_write_action(self, parts: Sequence[Part]) -> Plan[Results]:
-        nodes = {part.servo.node for part in parts}
-        self.maybe_armed |= nodes  # until each is known not to be: a plan may be cut off at any frame
+        self.maybe_armed |= {
+            part.servo.node: part.servo for part in parts
+        }  # until each is known not to be: a plan may be cut off at any frame
         results: Results = {}
         for part in parts:
             try:
@@ -116,7 +117,7 @@ class GoalWriter:
         yield from ask(Action())
         for part in armed:
             part.sent()
-            self.maybe_armed.discard(part.servo.node)
+            self.maybe_armed.pop(part.servo.node, None)
         return results
 
     def _arm(self, part: Part) -> Plan[None]:
@@ -131,19 +132,18 @@ class GoalWriter:
         silent = [part.servo.name for part in parts if part not in armed]
         if silent and self.options.on_partial == "abort":
             return f"{', '.join(silent)} did not acknowledge its REG WRITE (on_partial: abort)"
-        for node in sorted(self.maybe_armed - {part.servo.node for part in parts}):
+        for node in sorted(self.maybe_armed.keys() - {part.servo.node for part in parts}):
+            servo = self.maybe_armed[node]
             try:
-                pending = yield from ask(Read(node, self._flag_address(parts), 1, _first))
+                pending = yield from self._flag(servo)
             except ServobusError:
                 pending = 1
             if pending:
-                return f"id {node} may hold an older REG WRITE that ACTION would carry out, and does not say otherwise"
-            self.maybe_armed.discard(node)
+                yield from self._disarm(servo)
+            if pending and node in self.maybe_armed:
+                return f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
+            self.maybe_armed.pop(node, None)
         return ""
-
-    @staticmethod
-    def _flag_address(parts: Sequence[Part]) -> int:
-        return parts[0].servo.model.register("async_write_flag").address
 
     def _flag(self, servo: FittedServo) -> Plan[int]:
         register = servo.model.register("async_write_flag")
@@ -158,7 +158,7 @@ class GoalWriter:
             yield from ask(Action(servo.node, answered=self.acknowledged))
         except ServobusError:
             return  # it stays in maybe_armed, and holds back the next ACTION
-        self.maybe_armed.discard(servo.node)
+        self.maybe_armed.pop(servo.node, None)
 
 
 def split_sync_write(options: SmsBus, address: int, data: dict[int, bytes]) -> Iterator[SyncWrite]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
+from servobus.errors import NotSupported
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.sms.load import packaged_models
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read
 from servobus.protocols.sms.servo import FittedServo
-from servobus.protocols.words import Identity
+from servobus.protocols.words import GoalKind, Identity
 
 BIG_ENDIAN = 1
 """Address 2, END: 0 little, 1 big."""
@@ -26,6 +27,26 @@ def inspect(node: int) -> Plan[Identity]:
     return Identity(model=model.name if model else None, product=product or f"model number {number}", firmware=f"{major}.{minor}")
 
 
+def learn_mode(servo: FittedServo) -> Plan[None]:
+    """What the servo would do with a goal, asked before it is energised. Raises NotSupported for modes that are neither position
+    nor wheel."""
+    words: dict[str, int] = {}
+    for name in servo.model.wheel.registers if servo.model.wheel else ():
+        register = servo.model.register(name)
+        data = yield from ask(Read(servo.node, register.address, register.size, bytes))
+        words[name] = servo.decode(register, data)
+    servo.mode = _mode_of(servo, words)
+    if servo.mode == "position" and words.get("mode", 0):
+        raise NotSupported(
+            f"its mode register reads {words['mode']}, which is neither position nor wheel: set it to 0 or 1", servo=servo.name
+        )
+
+
+def _mode_of(servo: FittedServo, words: Mapping[str, int]) -> GoalKind:
+    wheel = servo.model.wheel.registers if servo.model.wheel else {}
+    return "velocity" if wheel and all(words[name] == value for name, value in wheel.items()) else "position"
+
+
 def identify(servo: FittedServo, options: SmsBus) -> Plan[Identity]:
     """The servo's own settings beside the config's; learns its mode. Writes nothing."""
     model = servo.model
@@ -36,7 +57,7 @@ def identify(servo: FittedServo, options: SmsBus) -> Plan[Identity]:
         register = model.register(name)
         data = yield from ask(Read(servo.node, register.address, register.size, bytes))
         words[name] = servo.decode(register, data)
-    servo.mode = "velocity" if wheel and all(words[name] == value for name, value in wheel.items()) else "position"
+    servo.mode = _mode_of(servo, words)
     limits = _stored_limits(servo, words)
     notes = tuple(_notes(servo, options, seen, words, limits))
     return replace(seen, mode=servo.mode, energised=bool(words[model.torque]), limits=limits, notes=notes)

@@ -145,8 +145,10 @@ class FittedServo:
                 raise LimitError(
                     "a duration needs the present position, and it is not known: read the servo first", servo=self.name
                 )
-            distance = abs(wanted.value - goal.start)
-            return self.rest_time(), self._speed(distance / wanted.duration) if distance else self.default_speed()
+            speed = abs(wanted.value - goal.start) / wanted.duration
+            if self.options.max_speed is not None:  # it may stand farther away than it was thought to when it was asked for
+                speed = min(speed, self.options.max_speed)
+            return self.rest_time(), self._speed(speed) if speed else self.default_speed()
         if wanted.speed is not None:
             return self.rest_time(), self._speed(wanted.speed)
         return self.rest_time(), self.default_speed()

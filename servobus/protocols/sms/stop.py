@@ -19,6 +19,7 @@ from servobus.protocols.sms.requests import Read, Write
 from servobus.protocols.sms.servo import FittedServo
 from servobus.protocols.words import StopReport, StopTarget
 
+ROUNDS = 3
 TIMES = 2
 """An unanswered frame is said twice, because a lossy line may swallow one."""
 
@@ -32,8 +33,11 @@ class Stopper:
     def stop(self, targets: Sequence[tuple[FittedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
         written = yield from self._write_at_once(targets)
         reports: dict[str, StopReport] = {}
-        for servo, target in targets:
-            reports[servo.name] = yield from self._finish(servo, target, servo.name in written)
+        for _ in range(ROUNDS):
+            # Each is asked once before any is asked again: one that does not answer must not hold up the others.
+            for servo, target in targets:
+                if servo.name not in reports or (target.reachable and not reports[servo.name].confirmed):
+                    reports[servo.name] = yield from self._finish(servo, target, servo.name in written)
         return reports
 
     def disable(self, servo: FittedServo) -> Plan[StopReport]:
@@ -86,8 +90,8 @@ class Stopper:
 
     def _hold(self, servo: FittedServo, target: StopTarget) -> Plan[StopReport]:
         """Goal := present, acknowledged or read back. Never for a servo that is limp."""
-        if not target.enabled and not (yield from self._read(servo, servo.model.registers[servo.model.torque])):
-            return StopReport("none", False, True, "it was limp")
+        if not (yield from self._read(servo, servo.model.registers[servo.model.torque])):
+            return StopReport("none", False, True, "it was limp" + (": it has restarted" if target.enabled else ""))
         if servo.mode == "velocity":
             register, raw = servo.speed, 0
         else:

@@ -10,13 +10,13 @@ from hypothesis import settings
 
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
-from servobus.protocols.words import Goal, ServoGoal
 from servobus.protocols.kst.codec import Frame, KstCodec, encode
 from servobus.protocols.kst.device import KstDevice, devices
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.load import packaged_model
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
+from servobus.protocols.words import Goal, ServoGoal
 from servobus.sim.line import blend
 
 R = TypeVar("R")

@@ -15,12 +15,12 @@ from servobus.errors import ReplyTimeout
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
-from servobus.protocols.words import Goal, Outcome
 from servobus.protocols.kst import ENTRY
 from servobus.protocols.kst.commission import Commissioning
 from servobus.protocols.kst.device import KstDevice
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.options import FaultOptions
+from servobus.protocols.words import Goal, Outcome
 from servobus.sim.line import SimLine
 from tests.protocols.kst.simulated import bus_options
 from tests.virtual import virtual

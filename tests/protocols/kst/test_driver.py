@@ -8,9 +8,9 @@ import pytest
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.base import Driver, run_plan
-from servobus.protocols.words import Goal, ServoGoal
 from servobus.protocols.kst.codec import Command, encode
 from servobus.protocols.kst.driver import KstDriver
+from servobus.protocols.words import Goal, ServoGoal
 from tests.protocols.kst.simulated import Bench, changed_model, goal
 
 

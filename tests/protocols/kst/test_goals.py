@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from servobus.errors import EchoMismatch, ReplyTimeout
-from servobus.protocols.words import Outcome, StopReport, StopTarget
 from servobus.protocols.kst.aborts import HardwareFault, OutOfRange
 from servobus.protocols.kst.codec import Command, encode, encode_position
 from servobus.protocols.kst.goals import HOLDS
+from servobus.protocols.words import Outcome, StopReport, StopTarget
 from tests.protocols.kst.simulated import Bench, changed_model, goal
 
 

@@ -146,7 +146,9 @@ def test_a_model_that_is_none_is_refused_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text((FILES.folder / "kst.yaml").read_text().replace("[-900, 900]", "[-960, 900]"))
     with pytest.raises(ConfigError, match=r"bad\.yaml:.*range \[-960, 900\] must be ascending"):
         FILES.read(tmp_path / "bad.yaml")
-    (tmp_path / "worse.yaml").write_text((FILES.folder / "kst.yaml").read_text().replace("default_speed: 600 ", "default_speed: -1 "))
+    (tmp_path / "worse.yaml").write_text(
+        (FILES.folder / "kst.yaml").read_text().replace("default_speed: 600 ", "default_speed: -1 ")
+    )
     with pytest.raises(ConfigError, match=r"worse\.yaml:9:16: default_speed: found -1; expected greater than 0"):
         FILES.read(tmp_path / "worse.yaml")
     (tmp_path / "other.yaml").write_text("extends: sts\n")

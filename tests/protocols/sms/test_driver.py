@@ -70,6 +70,49 @@ def test_disable_reads_back() -> None:
     assert (report.confirmed, report.detail) == (False, "torque still reads on")
 
 
+@pytest.mark.parametrize("mode", [2, 3])
+def test_a_mode_that_is_neither_is_not_enabled(mode: int) -> None:
+    bench = Bench()
+    device = bench.devices[1]
+    device.memory.store(device.memory.registers["mode"], mode)
+    with pytest.raises(NotSupported, match=f"its mode register reads {mode}"):
+        bench.run(bench.driver.enable("a"))
+    assert "WRITE" not in bench.instructions()
+
+
+def test_enable_asks_for_the_mode_anew() -> None:
+    bench = Bench()
+    device = bench.devices[1]
+    device.memory.store(device.memory.registers["mode"], 1)
+    assert bench.run(bench.driver.enable("a")) is None
+    assert bench.register(1, "goal_speed") == 0
+
+
+def test_an_enable_that_fails_half_way_ends_with_torque_off() -> None:
+    bench = Bench()
+    torque = bytes((40, 1))
+    bench.mute = lambda packet: packet.code == Instruction.READ and packet.params == torque
+    with pytest.raises(ReplyTimeout):
+        bench.run(bench.driver.enable("a"))
+    assert bench.register(1, "torque_enable") == 0
+
+
+def test_eeprom_of_an_energised_servo_is_not_written() -> None:
+    bench = Bench()
+    bench.enable()
+    with pytest.raises(NotSupported, match="its torque is on"):
+        bench.run(bench.driver.write_register("a", "mode", 1, persist=True))
+    assert bench.register(1, "mode") == 0
+
+
+def test_a_lost_answer_to_the_unlock_leaves_nothing_unlocked() -> None:
+    bench = Bench()
+    bench.mute = lambda packet: packet.code == Instruction.WRITE and packet.params == bytes((LOCK, 0))
+    with pytest.raises(ReplyTimeout):
+        bench.run(bench.driver.write_register("a", "return_delay", 100, raw=True, persist=True))
+    assert bench.register(1, "lock") == 1
+
+
 # Fences
 
 
@@ -215,6 +258,7 @@ def test_eeprom_is_unlocked_written_locked_and_read_back() -> None:
     bench = Bench()
     assert bench.run(bench.driver.write_register("a", "return_delay", 100, raw=True, persist=True)) == 100
     assert [(packet.code, *packet.params) for packet in bench.said] == [
+        (Instruction.READ, 40, 1),
         (Instruction.WRITE, LOCK, 0),
         (Instruction.WRITE, DELAY, 100),
         (Instruction.WRITE, LOCK, 1),

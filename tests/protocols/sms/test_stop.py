@@ -33,7 +33,7 @@ def test_known_positions_are_written_to_all_at_once_and_twice() -> None:
     reports = stop(bench, target("a", position=10.0), target("b", position=-10.0))
     assert bench.instructions()[:2] == ["SYNC_WRITE", "SYNC_WRITE"]
     assert bench.said[0].frame == bench.said[1].frame
-    assert bench.instructions()[2:] == ["READ", "WRITE"] * 2, "then each is asked where it is, and held there"
+    assert bench.instructions()[2:] == ["READ", "READ", "WRITE"] * 2, "each is asked whether and where it stands, and held there"
     assert all((report.action, report.written, report.confirmed) == ("hold", True, True) for report in reports.values())
     assert bench.register(1, "goal_position") == 2048
 
@@ -108,6 +108,25 @@ def test_torque_that_stays_on_is_told() -> None:
     device = bench.devices[1]
     bench.mute = meddle(device, 1)
     assert stop(bench, target("a", "limp"))["a"] == StopReport("limp", True, False, "torque still reads on")
+
+
+def test_one_that_restarted_unseen_is_not_energised() -> None:
+    bench = Bench()
+    bench.enable()
+    bench.devices[1].reboot(0.0)
+    bench.now = 10.0
+    assert stop(bench, target("a"))["a"] == StopReport("none", False, True, "it was limp: it has restarted")
+    assert bench.register(1, "torque_enable") == 0
+
+
+def test_each_is_asked_once_before_any_is_asked_again() -> None:
+    bench = Bench()
+    bench.enable()
+    bench.deaf = lambda packet: packet.id == 1
+    stop(bench, target("a"), target("b"))
+    ids = [packet.id for packet in bench.said if packet.id != 0xFE]
+    assert ids.index(2) == 1, "the dead one costs the live one a single question"
+    assert ids.count(1) == 3
 
 
 def test_without_acknowledgements_a_hold_is_read_back() -> None:

@@ -1,0 +1,134 @@
+"""Plans, and what every protocol's requests and lines have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from servobus.errors import LinkDown, ReplyTimeout
+from servobus.protocols.base import LineTraits, Plan, Request, ask, run_plan
+from servobus.protocols.table import PROTOCOLS
+
+
+class Number(Request[int]):
+    """A question whose value is the number it was made with."""
+
+    def __init__(self, number: int) -> None:
+        self.node, self.nodes, self.frame, self.number = 1, (1,), bytes((number,)), number
+
+    def answers(self, reply: object) -> bool:
+        return reply == self.number
+
+    def parse(self, replies: Sequence[Any]) -> int:
+        return self.number
+
+
+def numbered(request: Request[Any]) -> int:
+    assert isinstance(request, Number)
+    return request.number
+
+
+def refusing(request: Request[Any]) -> int:
+    raise ReplyTimeout(f"no answer to {numbered(request)}")
+
+
+def total(*numbers: int) -> Plan[int]:
+    found = 0
+    for number in numbers:
+        found += yield from ask(Number(number))
+    return found
+
+
+def test_a_plan_is_sent_what_its_requests_return() -> None:
+    said: list[int] = []
+
+    def exchange(request: Request[Any]) -> int:
+        said.append(numbered(request))
+        return 10 * numbered(request)
+
+    assert run_plan(total(1, 2, 3), exchange) == 60
+    assert said == [1, 2, 3]
+
+
+def test_a_plan_may_say_nothing() -> None:
+    assert run_plan(total(), refusing) == 0
+
+
+def test_an_error_goes_into_the_plan_which_may_go_on() -> None:
+    def careful() -> Plan[str]:
+        try:
+            yield from ask(Number(1))
+        except ReplyTimeout as error:
+            return f"{error}, then {(yield from total())}"
+        return "answered"
+
+    assert run_plan(careful(), refusing) == "no answer to 1, then 0"
+    assert run_plan(careful(), numbered) == "answered"
+
+
+def test_an_error_that_a_plan_does_not_take_ends_it() -> None:
+    with pytest.raises(ReplyTimeout, match="no answer to 1"):
+        run_plan(total(1, 2), refusing)
+
+
+def test_a_plan_may_say_more_after_an_error() -> None:
+    said: list[int] = []
+
+    def tidy() -> Plan[int]:
+        try:
+            return (yield from total(1, 2))
+        except LinkDown:
+            yield from ask(Number(9))
+            raise
+
+    def exchange(request: Request[Any]) -> int:
+        said.append(numbered(request))
+        if said == [1, 2]:
+            raise LinkDown("gone")
+        return 0
+
+    with pytest.raises(LinkDown, match="gone"):
+        run_plan(tidy(), exchange)
+    assert said == [1, 2, 9]
+
+
+def test_a_mistake_in_the_exchange_is_no_answer_of_the_plan() -> None:
+    def broken(request: Request[Any]) -> int:
+        raise ZeroDivisionError
+
+    def deaf() -> Plan[int]:
+        try:
+            return (yield from total(1))
+        except Exception:  # noqa: BLE001 - it must not come here
+            return -1
+
+    with pytest.raises(ZeroDivisionError):
+        run_plan(deaf(), broken)
+
+
+def test_what_a_request_is_unless_it_says_otherwise() -> None:
+    request = Number(1)
+    assert (request.replies, request.idempotent, request.partial) == (1, True, False)
+    assert (request.quiet_after, request.service_time) == (0.0, 0.0)
+    assert request.plain() is None, "its echo cannot be an answer"
+
+
+@pytest.mark.parametrize(("baudrate", "seconds"), [(1_000_000, 10e-6), (115_200, 10 / 115_200), (None, 0.0)])
+def test_a_byte_takes_ten_bits(baudrate: int | None, seconds: float) -> None:
+    assert LineTraits(baudrate).byte_time == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_line_of_the_table_is_whole(name: str) -> None:
+    entry = PROTOCOLS[name]
+    keys = {"protocol": name, "port": "sim:", "baudrate": entry.baudrates[0]}
+    options = entry.options.model_validate(keys)
+    assert options.protocol == name
+    assert len(set(entry.baudrates)) == len(entry.baudrates)
+    for codec in (entry.codec(options), entry.codec(None), entry.device_codec(options)):
+        codec.receive_data(b"\x00")
+        assert codec.next_reply() is None
+    assert entry.driver(options, {}).nodes == {}
+    assert entry.devices(options, {}) == []
