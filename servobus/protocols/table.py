@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from servobus.protocols import kst, sms
+from servobus.protocols import kst, roh, sms
 from servobus.protocols.entry import ProtocolEntry
 
 PROTOCOLS: dict[str, ProtocolEntry] = {
     "sms": sms.ENTRY,
     "kst": kst.ENTRY,
+    "roh": roh.ENTRY,
 }

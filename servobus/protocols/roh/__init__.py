@@ -1,0 +1,32 @@
+"""OHand ROH hands: holding registers by Modbus-RTU (the seed), on a line of their own or behind a RealMan arm."""
+
+from servobus.protocols.entry import ProtocolEntry
+from servobus.protocols.modbus.codec import MAX_UNIT, ModbusCodec, node_of, rename
+from servobus.protocols.roh.device import devices
+from servobus.protocols.roh.driver import RohDriver
+from servobus.protocols.roh.load import load_models
+from servobus.protocols.roh.options import RohBus
+
+
+def codec(options: RohBus | None) -> ModbusCodec:
+    """For the master; the language knows no variants."""
+    return ModbusCodec("master")
+
+
+def device_codec(options: RohBus | None) -> ModbusCodec:
+    return ModbusCodec("device")
+
+
+ENTRY = ProtocolEntry(
+    options=RohBus,
+    models=load_models,
+    codec=codec,
+    driver=RohDriver,
+    device_codec=device_codec,
+    devices=devices,
+    rename=rename,
+    node_of=node_of,
+    # All hands ship with the first; those of the second generation find the line's rate by themselves, within these.
+    baudrates=(115_200, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600),
+    scan_ids=range(1, MAX_UNIT + 1),
+)

@@ -1,0 +1,98 @@
+"""The YAML keys of a line of ROH hands. A hand is a unit, its fingers are servos: id is the unit, channel the finger."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from servobus.protocols.modbus.codec import MAX_READ, MAX_UNIT, MAX_WRITE
+from servobus.protocols.model import Data
+from servobus.protocols.options import BusOptions, Name, ServoOptions
+from servobus.protocols.roh.model import Channel
+
+Unit = Annotated[int, Field(ge=1, le=MAX_UNIT)]
+Map = Literal["legacy", "v1", "v2"]
+MAPS: tuple[Map, ...] = ("legacy", "v1", "v2")
+
+ALWAYS_HOLDS = "a ROH hand has no torque command, so nothing can make a finger limp: it always holds. Use hold"
+TUNNEL = "realman:"
+TUNNEL_READ, TUNNEL_WRITE = 12, 10
+"""Registers a RealMan arm of generation 2 or 3 passes on in one call."""
+USUAL = 64
+"""Registers of one question; the hand's own limit is documented nowhere."""
+
+
+class RohServo(ServoOptions):
+    """One finger."""
+
+    id: Unit
+    """The hand's unit, 1 to 247; the factory's is 2."""
+    channel: Channel
+    model: Literal["finger"] = "finger"
+    """What map the hand has stands under `units`."""
+    unit: Literal["%", "deg"] | None = None
+    """%: 0 open to 100 closed; deg: by the angle registers."""
+
+    @property
+    def key(self) -> Hashable:
+        return self.id, self.channel
+
+    @field_validator("on_estop", "on_exit", "on_lost_client")
+    @classmethod
+    def _never_limp(cls, kind: str) -> str:
+        if kind == "limp":
+            raise ValueError(ALWAYS_HOLDS)
+        return kind
+
+    @model_validator(mode="after")
+    def _has_no_register_for_it(self) -> Self:
+        if self.acceleration is not None:
+            raise ValueError("acceleration: a ROH hand has no register for it: take it out")
+        return self
+
+
+class UnitOptions(Data):
+    """One hand."""
+
+    model: Literal["auto", "legacy", "v1", "v2"] = "auto"
+    """Its register map. auto: as its first registers say; a pinned one is compared with them, and refused where they differ."""
+
+
+class RohBus(BusOptions):
+    protocol: Literal["roh"]
+    baudrate: Annotated[int, Field(ge=300, le=10_000_000)] = 115_200
+    units: dict[Unit, UnitOptions] = {}
+    """Hands whose map is pinned; all others are `auto`."""
+    max_read: Annotated[int, Field(ge=1, le=MAX_READ)] | None = None
+    """Registers of one read; 64 if omitted, 12 through a RealMan arm."""
+    max_write: Annotated[int, Field(ge=1, le=MAX_WRITE)] | None = None
+    """Registers of one write; 64 if omitted, 10 through a RealMan arm."""
+    single_write: Literal["multiple", "single"] = "multiple"
+    """How one register is written. single (0x06): its answer looks like an echo, so only for lines that have none."""
+    turnaround_ms: Annotated[float, Field(ge=0, le=10_000)] = 100.0
+    """Silence after a broadcast."""
+    servos: dict[Name, RohServo] = {}
+    """Empty: a line to scan."""
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.single_write == "single" and self.echo == "auto":
+            raise ValueError("single_write: single needs to know whether the line echoes: set echo to off or on")
+        fingers = {servo.id for servo in self.servos.values()}
+        for unit in self.units:
+            if fingers and unit not in fingers:
+                raise ValueError(f"units: no servo has the id {unit}; there are {', '.join(map(str, sorted(fingers)))}")
+        return self
+
+    def map_of(self, unit: int) -> str:
+        return self.units[unit].model if unit in self.units else "auto"
+
+    @property
+    def read_limit(self) -> int:
+        return self.max_read or (TUNNEL_READ if self.port.startswith(TUNNEL) else USUAL)
+
+    @property
+    def write_limit(self) -> int:
+        return self.max_write or (TUNNEL_WRITE if self.port.startswith(TUNNEL) else USUAL)
