@@ -30,6 +30,10 @@ class LineTraits:
     gap: float = 0.0
     """Silence before each frame."""
     can_change_baud: bool = False
+    max_read: int | None = None
+    """Registers that one read can bring through a tunnel; None: as many as the protocol has room for."""
+    max_write: int | None = None
+    """Registers that one write can carry through it, likewise."""
 
     @property
     def byte_time(self) -> float:
