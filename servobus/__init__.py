@@ -1,6 +1,7 @@
 """servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos."""
 
 from servobus.errors import (
+    AccessDenied,
     ActionWithheld,
     ConfigError,
     DeviceError,
@@ -21,16 +22,20 @@ from servobus.errors import (
     ServobusError,
     UnknownName,
 )
-from servobus.local import open_rig as open
-from servobus.protocols.words import Goal, Identity, Outcome, State, StopReport
-from servobus.rig import Found, Rig, Servo, Snapshot
+from servobus.events import Event
+from servobus.opening import open_rig as open
+from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
+from servobus.rig import Found, Reload, Rig, Servo, Snapshot
 
 __all__ = [
+    "AccessDenied",
     "ActionWithheld",
+    "Change",
     "ConfigError",
     "DeviceError",
     "EStopped",
     "EchoMismatch",
+    "Event",
     "Found",
     "Goal",
     "GoalExpired",
@@ -46,6 +51,7 @@ __all__ = [
     "PortBusy",
     "PortDenied",
     "PortMissing",
+    "Reload",
     "ReplyTimeout",
     "Rig",
     "Servo",

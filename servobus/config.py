@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, TypeVar, Union
 
-from pydantic import Field, TypeAdapter
+from pydantic import BaseModel, Field, TypeAdapter
 
 from servobus import yamlfile
+from servobus.access import AccessOptions, DoorOptions
 from servobus.complaints import Complaints, show, sound_part
 from servobus.errors import ConfigError, ServobusError
 from servobus.links import check_port
@@ -24,8 +25,10 @@ from servobus.protocols.table import PROTOCOLS
 from servobus.sim.build import SIMULATED, has_wire_time
 from servobus.yamlfile import KeyPath
 
+P = TypeVar("P", bound=BaseModel)
 VERSION = 1
-KEYS = ("version", "buses")
+KEYS = ("version", "buses", "access", "door")
+REQUIRED = ("version", "buses")
 _name = TypeAdapter(Name)
 
 
@@ -37,11 +40,19 @@ class Config:
     buses: Mapping[str, BusOptions]
     models: Mapping[str, Mapping[str, ServoModel]]
     """Bus -> model name -> model."""
+    access: AccessOptions = field(default_factory=AccessOptions)
+    door: DoorOptions = field(default_factory=DoorOptions)
 
     @property
     def names(self) -> dict[str, tuple[str, str]]:
         """bus/servo -> (bus, servo), in the order of the file."""
         return {f"{bus}/{servo}": (bus, servo) for bus, options in self.buses.items() for servo in options.servos}
+
+    def has_same(self, bus: str, other: Config) -> bool:
+        """Nothing differs on this bus."""
+        if bus not in self.buses or bus not in other.buses:
+            return False
+        return self.buses[bus] == other.buses[bus] and self.models[bus] == other.models[bus]
 
 
 def load_config(path: str | Path) -> Config:
@@ -58,17 +69,24 @@ def config_schema() -> dict[str, Any]:
     """JSON Schema, for editors."""
     options = tuple(entry.options for entry in PROTOCOLS.values())
     bus: Any = Annotated[Union[options], Field(discriminator="protocol")] if len(options) > 1 else options[0]  # noqa: UP007
-    schema = TypeAdapter(dict[Name, bus]).json_schema(ref_template="#/$defs/{model}")
-    definitions = schema.pop("$defs", {})
+    definitions: dict[str, Any] = {}
+
+    def schema(kind: Any) -> dict[str, Any]:
+        made = TypeAdapter(kind).json_schema(ref_template="#/$defs/{model}")
+        definitions.update(made.pop("$defs", {}))
+        return made
+
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "servobus config",
         "type": "object",
         "properties": {
             "version": {"const": VERSION, "description": "Of this format."},
-            "buses": {**schema, "minProperties": 1, "description": "Lines by name; each has one owner."},
+            "buses": {**schema(dict[Name, bus]), "minProperties": 1, "description": "Lines by name; each has one owner."},
+            "access": schema(AccessOptions),
+            "door": schema(DoorOptions),
         },
-        "required": list(KEYS),
+        "required": list(REQUIRED),
         "additionalProperties": False,
         "$defs": definitions,
     }
@@ -84,8 +102,16 @@ def _config(document: yamlfile.Document, folder: Path) -> Config:
             buses[str(name)] = options
             models[str(name)] = _models(("buses", name), options, folder, complaints)
     _check_ports(buses, complaints)
+    data = document.data if isinstance(document.data, dict) else {}
+    access = _part(AccessOptions, "access", data, complaints)
+    door = _part(DoorOptions, "door", data, complaints)
     complaints.raise_any()
-    return Config(VERSION, buses, models)
+    return Config(VERSION, buses, models, access, door)
+
+
+def _part(kind: type[P], key: str, data: Mapping[Any, Any], complaints: Complaints) -> P:
+    """What the daemon's keys say; all of them may be left out."""
+    return (complaints.validated(kind, data[key], (key,)) if key in data else None) or kind()
 
 
 def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str | int, Any]]:

@@ -110,6 +110,10 @@ class LeaseHeld(ServobusError):
     """Another client, or an exclusive session, holds motion here. Nothing was sent."""
 
 
+class AccessDenied(ServobusError):
+    """Your role does not allow that, or the token is not right. Nothing was done."""
+
+
 class Overloaded(ServobusError):
     """A bounded queue is full. Nothing was sent; ask for less, or later."""
 

@@ -1,42 +1,30 @@
-"""LocalRig: the rig whose ports this process owns.
-
-Each bus has a keeper: it opens the port, introduces the servos, waits for the line to go down and opens it again, and
-none of it touches another bus. Nothing is written at start; at the end every servo that was enabled here is left as its
-`on_exit` says.
-"""
+"""LocalRig: the rig whose ports this process owns. What becomes of one bus stands in `keeper.py`."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
-from contextlib import asynccontextmanager
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-import anyio
 import structlog
+from anyio.abc import TaskGroup
 
 from servobus.bus.scan import scan
 from servobus.bus.service import BusService
 from servobus.config import Config, load_config
-from servobus.errors import EStopped, LimitError, LinkDown, UnknownName
-from servobus.links import open_link
-from servobus.links.base import Link
-from servobus.protocols.options import BusOptions
+from servobus.errors import EStopped, LeaseHeld, LimitError, NotSupported, UnknownName
+from servobus.events import Announcer, Event
+from servobus.gather import outcomes, raise_failures
+from servobus.keeper import Keeper, Trace
 from servobus.protocols.table import PROTOCOLS
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
-from servobus.rig import Found, Rig, Snapshot, outcomes, raise_failures, uncancelled
-from servobus.sim.build import SimLink, simulated_link
+from servobus.rig import Found, Reload, Rig, Snapshot
 
 R = TypeVar("R")
-Trace = Callable[[str, bool, bytes, float], None]
-"""(bus, sent, bytes, monotonic seconds) of everything on the wire."""
-
-RETRY = 0.1
-"""Seconds between two looks for a port that is not there."""
-EXIT_TIMEOUT = 1.0
-"""Seconds the exit policies may take, parking apart."""
+QUIET = frozenset({"line_up", "echo_probed", "estop_cleared", "servo_online", "reloaded"})
+"""Events that are no reason to look."""
 
 log = structlog.get_logger("servobus")
 
@@ -44,32 +32,30 @@ log = structlog.get_logger("servobus")
 class LocalRig(Rig):
     """Made by `servobus.open`, and alive as long as that context."""
 
-    def __init__(self, config: Config, only: Collection[str] = (), trace: Trace | None = None) -> None:
+    def __init__(
+        self, config: Config, keepers: TaskGroup, only: Collection[str] = (), trace: Trace | None = None, path: Path | None = None
+    ) -> None:
         self.config = config
-        self.buses: dict[str, BusService] = {}
-        self.links: dict[str, Link] = {}
+        self.path = path
+        """The file `reload` reads; None: there is none."""
         self.left: dict[str, StopReport] = {}
         """What became of each servo that was still enabled at the end, by full name; filled when the context has ended."""
-        self._names = {name: place for name, place in config.names.items() if not only or place[0] in only}
-        self._tried: dict[str, asyncio.Event] = {}
-        self._down: dict[str, LinkDown] = {}
+        self.announcer = Announcer()
+        self._only = only
+        self._trace = trace
+        self._group = keepers
         self._stopping: set[asyncio.Task[Any]] = set()
-        for name in only or config.buses:
-            self._add(name, config.buses[name])
-            if trace is not None:
-                self.buses[name].master.trace = partial(trace, name)
+        self._reloading: asyncio.Task[Reload] | None = None
+        self.keepers = {name: self._keeper(name, config) for name in only or config.buses}
+        self._know()
 
-    def _add(self, name: str, options: BusOptions) -> None:
-        entry, models = PROTOCOLS[options.protocol], self.config.models[name]
-        link = (
-            simulated_link(options, models)
-            if options.port.startswith("sim:")
-            else open_link(options.port, options.baudrate, rs485=options.rs485)
-        )
-        driver = entry.driver(options, models)
-        self.links[name] = link
-        self.buses[name] = BusService(name, options, driver, entry.codec(options), link.traits, self._event)
-        self._tried[name] = asyncio.Event()
+    def _keeper(self, name: str, config: Config) -> Keeper:
+        return Keeper(name, config.buses[name], config.models[name], self._event, self._trace)
+
+    def _know(self) -> None:
+        """The names that go with the keepers."""
+        self.buses: dict[str, BusService] = {name: keeper.bus for name, keeper in self.keepers.items()}
+        self._names = {name: place for name, place in self.config.names.items() if place[0] in self.keepers}
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
@@ -82,62 +68,71 @@ class LocalRig(Rig):
 
     # Lines
 
-    async def keep(self, name: str, degraded: bool) -> None:
-        """Open the line, and again whenever it is gone. Ends by being cancelled."""
-        bus, link = self.buses[name], self.links[name]
-        while True:
-            bus.line.traits = link.traits  # what the port is may have changed while it was away
-            try:
-                await link.connect(bus.master)
-            except LinkDown as error:
-                tried = self._tried[name].is_set()  # the first time it may be raised, and need not be told twice
-                if (tried or degraded) and str(error) != str(self._down.get(name)):
-                    self._event("waiting_for_port", bus=name, port=link.address, reason=error.message)
-                self._down[name] = error
-                self._tried[name].set()
-                await anyio.sleep(RETRY)
-                continue
-            self._down.pop(name, None)
-            self._event("line_up", bus=name, port=link.address)
-            await bus.start()
-            self._tried[name].set()
-            await bus.master.wait_closed()
-            self._event("line_down", bus=name, port=link.address)
-
-    async def ready(self, *, degraded: bool) -> None:
+    async def start(self, *, degraded: bool) -> None:
         """Until every line was tried. Raises the first LinkDown, unless `degraded`."""
-        for tried in self._tried.values():
-            await tried.wait()
-        if self._down and not degraded:
-            name, error = next(iter(self._down.items()))
-            raise error.at(bus=name)
+        for keeper in self.keepers.values():
+            self._group.start_soon(keeper.run, degraded)
+        for keeper in self.keepers.values():
+            await keeper.tried.wait()
+        if not degraded:
+            for name, keeper in self.keepers.items():
+                if keeper.down is not None:
+                    raise keeper.down.at(bus=name)
+
+    async def acquire(self, *names: str) -> None:
+        self.full_names(names)
+
+    async def release(self, *names: str) -> None:
+        self.full_names(names)
+
+    async def reload(self) -> Reload:
+        if self.path is None:
+            raise NotSupported("this rig was not opened from a file, so there is none to read again")
+        config = load_config(self.path)  # an invalid file ends here, and nothing has changed
+        if self._reloading is not None and not self._reloading.done():
+            raise LeaseHeld("the config is being read anew already: wait until that is done")
+        self._reloading = asyncio.create_task(self._reload(config))
+        return await asyncio.shield(self._reloading)  # a caller that leaves does not stop it half-way
+
+    async def _reload(self, config: Config) -> Reload:
+        await asyncio.gather(*self._stopping)
+        wanted = [name for name in config.buses if not self._only or name in self._only]
+        kept = {name for name in self.keepers if name in wanted and config.has_same(name, self.config)}
+        gone = {name: keeper for name, keeper in self.keepers.items() if name not in kept}
+        self.left.update(await self._leave(gone.values()))
+        await asyncio.gather(*map(self._end, gone.values()))
+        latched = self.stopped
+        self.config = config
+        self.keepers = {name: self.keepers[name] if name in kept else self._keeper(name, config) for name in wanted}
+        self._know()
+        new = [name for name in wanted if name not in kept]
+        for name in new:
+            self.buses[name].motion.latched = latched
+            self._group.start_soon(self.keepers[name].run, True)
+        added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
+        report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
+        self._event("reloaded", **asdict(report))
+        return report
+
+    @staticmethod
+    async def _end(keeper: Keeper) -> None:
+        keeper.scope.cancel()
+        await keeper.close()
 
     async def leave(self) -> None:
-        """Exit policies, on all buses at once: park first where a servo says so. `left` tells what became of each servo."""
-        await asyncio.gather(*self._stopping)
-        for bus in self.buses.values():
-            bus.motion.leaving = True
-            for record in bus.motion.to_leave():
-                self.left[f"{bus.name}/{record.name}"] = StopReport(record.options.on_exit, False, False, "no answer in time")
-        parking = [] if self.stopped else self._enabled("on_exit", "park")  # what the e-stop holds stays
-        reports = await asyncio.gather(*(self._park(bus, servo) for bus, servo in parking))
-        self.left.update({f"{bus.name}/{servo}": report for (bus, servo), report in zip(parking, reports, strict=True)})
-        await asyncio.gather(*(self._leave(bus) for bus in self.buses.values()))
-        for name, report in self.left.items():
-            if not report.confirmed and report.action != "park":  # that has its own event
-                self._event("exit_unconfirmed", servo=name, action=report.action, detail=report.detail)
+        """Exit policies, on all buses at once. `left` tells what became of each servo."""
+        reloading = () if self._reloading is None else (self._reloading,)
+        await asyncio.gather(*self._stopping, *reloading, return_exceptions=True)
+        self.left.update(await self._leave(self.keepers.values()))
 
-    async def _leave(self, bus: BusService) -> None:
-        with anyio.move_on_after(EXIT_TIMEOUT):
-            for servo, report in (await bus.motion.leave()).items():
-                self.left[f"{bus.name}/{servo}"] = report
+    @staticmethod
+    async def _leave(keepers: Iterable[Keeper]) -> dict[str, StopReport]:
+        reports = await asyncio.gather(*(keeper.leave() for keeper in keepers))
+        return {name: report for part in reports for name, report in part.items()}
 
     async def close(self) -> None:
         """Every line, once nobody opens them again."""
-        await asyncio.gather(*(bus.master.close() for bus in self.buses.values()))
-        for link in self.links.values():
-            if isinstance(link, SimLink):
-                link.close()
+        await asyncio.gather(*(keeper.close() for keeper in self.keepers.values()))
 
     # Motion
 
@@ -168,10 +163,10 @@ class LocalRig(Rig):
 
     async def _stop_all(self) -> dict[str, StopReport]:
         self._event("estop")
-        parking = self._enabled("on_estop", "park")
+        parking = [(keeper, record) for keeper in self.keepers.values() for record in keeper.enabled("on_estop", "park")]
         reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
-        for bus, servo in parking:
-            self._track(self._park(bus, servo))
+        for keeper, record in parking:
+            self._track(keeper.park(record))
         return {
             f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
         }
@@ -199,26 +194,33 @@ class LocalRig(Rig):
         waits = (bus.motion.settle(servo, tolerance=tolerance, timeout=timeout) for bus, servo in places)
         return dict(zip(full, await asyncio.gather(*waits), strict=True))
 
-    async def _park(self, bus: BusService, servo: str) -> StopReport:
-        """To the park pose, then limp; limp also when it does not get there in time."""
-        report = await bus.motion.park(servo)
-        if not report.confirmed:
-            self._event("park_unconfirmed", bus=bus.name, servo=servo, detail=report.detail)
-        return report
+    async def abandon(self, names: Iterable[str]) -> dict[str, StopReport]:
+        """Whoever moved these servos (full names) is gone: each that is enabled does its `on_lost_client`. Returns when that is
+        done, parking too."""
+        parts: dict[str, set[str]] = {}
+        for name in names:
+            bus, servo = self._names[name]
+            parts.setdefault(bus, set()).add(servo)
+        done = await asyncio.gather(*(self._track(self._abandon(self.keepers[bus], part)) for bus, part in parts.items()))
+        return {f"{bus}/{servo}": report for bus, part in zip(parts, done, strict=True) for servo, report in part.items()}
 
-    def _enabled(self, policy: str, kind: str) -> list[tuple[BusService, str]]:
-        return [
-            (bus, record.name)
-            for bus in self.buses.values()
-            for record in bus.records.values()
-            if record.enabled and getattr(record.options, policy) == kind
-        ]
+    @staticmethod
+    async def _abandon(keeper: Keeper, servos: Collection[str]) -> dict[str, StopReport]:
+        parking = [record for record in keeper.enabled("on_lost_client", "park") if record.name in servos]
+        reports = await keeper.bus.motion.abandon(servos)
+        parked = await asyncio.gather(*map(keeper.park, parking))
+        return reports | {record.name: report for record, report in zip(parking, parked, strict=True)}
 
     # Reading
 
     async def read(self, name: str, *, max_age: float | None = None) -> State:
         bus, servo = self.bus_of(name)
         return await bus.read(servo, max_age)
+
+    def known(self, name: str, max_age: float) -> State | None:
+        """What `read` would answer without a turn; None: it would need one."""
+        bus, servo = self.bus_of(name)
+        return bus.state(servo) if bus.knows(servo, max_age) else None
 
     def snapshot(self) -> Snapshot:
         return {name: self.buses[bus].state(servo) for name, (bus, servo) in self._names.items()}
@@ -278,32 +280,9 @@ class LocalRig(Rig):
         results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
         raise_failures(dict(zip(full, results, strict=True)))
 
-    @staticmethod
-    def _event(name: str, **fields: Any) -> None:
-        quiet = name in {"line_up", "echo_probed", "estop_cleared", "servo_online"}
-        (log.info if quiet else log.warning)(name, **fields)
+    def _event(self, name: str, **fields: Any) -> None:
+        (log.info if name in QUIET else log.warning)(name, **fields)
+        self.announcer.tell(Event(name, asyncio.get_running_loop().time(), fields))
 
-
-@asynccontextmanager
-async def open_rig(
-    config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False, trace: Trace | None = None
-) -> AsyncIterator[LocalRig]:
-    """This process owns the ports of `config` (a path, or a loaded Config) until the context ends; then each servo enabled here
-    is left as its `on_exit` says. `buses`: only these. `degraded`: ports that cannot be opened are waited for instead of raising.
-    `trace` is called with every piece of bytes on the wire, both ways.
-    Raises ConfigError, PortMissing, PortBusy, PortDenied, LinkDown."""
-    rig = LocalRig(config if isinstance(config, Config) else load_config(config), buses, trace)
-    failure: BaseException | None = None
-    async with anyio.create_task_group() as keepers:
-        try:
-            for name in rig.buses:
-                keepers.start_soon(rig.keep, name, degraded)
-            await rig.ready(degraded=degraded)
-            yield rig
-        except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
-            failure = error
-        cancelled = await uncancelled(rig.leave())
-        keepers.cancel_scope.cancel()
-    cancelled = await uncancelled(rig.close()) or cancelled
-    if failure or cancelled:
-        raise failure or cancelled  # type: ignore[misc]
+    def events(self) -> AsyncIterator[Event]:
+        return self.announcer.events()

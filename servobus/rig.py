@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import anyio
-
-from servobus.errors import PartialFailure, ServobusError, UnknownName
+from servobus.errors import UnknownName
+from servobus.events import Event
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 
 Snapshot = dict[str, State]
@@ -36,6 +35,16 @@ class Found:
     note: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """What reading the config anew has changed, by bus."""
+
+    added: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+    """Ended as at exit, and begun anew: their servos are not enabled."""
+    removed: tuple[str, ...] = ()
+
+
 def full_name(names: Mapping[str, tuple[str, str]], name: str) -> str:
     """bus/servo for a full or a unique bare name; `names` as in `Rig.names`. Raises UnknownName and lists what there is."""
     if name in names:
@@ -46,38 +55,6 @@ def full_name(names: Mapping[str, tuple[str, str]], name: str) -> str:
     if matches:
         raise UnknownName(f"{name!r} is on several buses: say one of {', '.join(matches)}")
     raise UnknownName(f"no servo {name!r}: there are {', '.join(names) or 'none'}")
-
-
-async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
-    """All of them, by name. Raises as `raise_failures`."""
-    results = await asyncio.gather(*futures.values(), return_exceptions=True)
-    named = dict(zip(futures, results, strict=True))
-    raise_failures(named)
-    return {name: result for name, result in named.items() if isinstance(result, Outcome)}
-
-
-async def uncancelled(work: Coroutine[Any, Any, None]) -> asyncio.CancelledError | None:
-    """Do it to its end, whoever cancels us meanwhile; returns the cancellation, to be raised when all is done."""
-    task, cancelled = asyncio.ensure_future(work), None
-    with anyio.CancelScope(shield=True):
-        while not task.done():
-            try:
-                await asyncio.shield(task)
-            except asyncio.CancelledError as error:
-                if not task.done():
-                    cancelled = error
-    task.result()
-    return cancelled
-
-
-def raise_failures(results: Mapping[str, Any]) -> None:
-    """One result raises its own error; several raise PartialFailure. What is no error of ours is raised as it is."""
-    failures = [result for result in results.values() if isinstance(result, BaseException)]
-    for failure in failures:
-        if not isinstance(failure, ServobusError) or len(results) == 1:
-            raise failure
-    if failures:
-        raise PartialFailure(results)
 
 
 class Servo:
@@ -277,3 +254,21 @@ class Rig(ABC):
     @abstractmethod
     def stats(self) -> dict[str, Any]:
         """Counters and latencies of each bus, and the condition of each node."""
+
+    @abstractmethod
+    def events(self) -> AsyncIterator[Event]:
+        """What happens from now on: servos that come and go, faults, stops. A slow reader loses the oldest and is told."""
+
+    @abstractmethod
+    async def acquire(self, *names: str) -> None:
+        """Take the motion lease of these servos, or of all: nobody else moves them until `release`. A move takes it by itself;
+        in a process that owns its ports there is nobody else. Raises LeaseHeld."""
+
+    @abstractmethod
+    async def release(self, *names: str) -> None:
+        """Give it back: what moves, moves on to its goal."""
+
+    @abstractmethod
+    async def reload(self) -> Reload:
+        """Read the config file anew: all of it or nothing. Buses that did not change go on; a changed or removed one ends as at
+        exit. Raises ConfigError, NotSupported."""

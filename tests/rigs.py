@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from servobus.config import Config, parse_config
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.sms.device import SmsDevice
 from servobus.sim.build import SimLink, far_end, simulated_line
 from servobus.sim.pty import SimPty
@@ -32,7 +33,7 @@ def config(*servos: str, port: str = "sim:", **keys: Any) -> Config:
 
 def devices(rig: LocalRig, bus: str = "arm") -> dict[int, SmsDevice]:
     """The simulated servos of a bus in memory, by id."""
-    link = cast("SimLink", rig.links[bus])
+    link = cast("SimLink", rig.keepers[bus].link)
     return {device.node: cast("SmsDevice", device) for device in link.line.devices}
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from servobus.config import parse_config
 from servobus.errors import EStopped, LimitError, NotEnabled
-from servobus.local import open_rig
+from servobus.opening import open_rig
 from servobus.protocols.words import Outcome
 from tests.virtual import virtual
 

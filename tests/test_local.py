@@ -21,7 +21,8 @@ from servobus.errors import (
     ReplyTimeout,
     UnknownName,
 )
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.device import SmsDevice
 from servobus.protocols.words import Goal, Outcome
@@ -378,7 +379,7 @@ async def test_unplug_fails_what_waits_and_replug_sends_no_old_goal() -> None:
     wire = Wire()
     async with open_rig(config(poll="{feedback: 50}"), trace=wire) as rig:
         await rig.enable()
-        link = rig.links["arm"]
+        link = rig.keepers["arm"].link
         waiting = [asyncio.create_task(rig.read(f"s{number}")) for number in (1, 2, 3)]
         moving = asyncio.create_task(rig.move({"s1": 50, "s2": 50}))
         await asyncio.sleep(0)

@@ -11,7 +11,8 @@ import pytest
 
 from servobus.config import Config
 from servobus.errors import ServobusError
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.words import Outcome
 from tests.rigs import config, pty_rig
 from tests.virtual import virtual

@@ -70,12 +70,13 @@ class BusMaster(asyncio.Protocol):
         if self.runner.idle and (not self._flight or self.line.spread is not None):
             self._pump()
 
-    def submit_estop(self, job: Job) -> None:
-        """Ahead of everything; what moves is dropped. Raises LinkDown."""
+    def submit_stop(self, job: Job, *, estop: bool) -> None:
+        """Before all that waits. `estop`: what moves is dropped, and a plan under way is torn. Raises LinkDown."""
         if self._transport is None:
             raise LinkDown("the line is down: nothing can be stopped through it", bus=self.name)
-        self._scheduler.drop(self.runner.estopped, motion_only=True)
-        self._scheduler.estop.append(job)
+        if estop:
+            self._scheduler.drop(self.runner.estopped, motion_only=True)
+        (self._scheduler.estop if estop else self._scheduler.stops).append(job)
         self._pump()
 
     def goals_waiting(self) -> None:
@@ -133,10 +134,8 @@ class BusMaster(asyncio.Protocol):
             self.trace(False, data, now)
         self._counts["bytes_heard"] += len(data)
         line = self.line
-        if line.echo is not None:
-            data = line.echo.strip(data)
-            if not data:
-                return
+        if line.echo is not None and not (data := line.echo.strip(data)):
+            return
         flight = self._flight
         if not flight or (line.traits.paced and self._is_early(len(data), now, flight[0])):
             self._unsolicited(data, now)
@@ -203,9 +202,7 @@ class BusMaster(asyncio.Protocol):
         """On four wires: say the next while the answers to the last are due. False: not now."""
         last = self._flight[-1]
         at = self.line.next_at(last.request.reply_size, now) if last.run is not None else None
-        if at is None:
-            return False
-        if at > now:
+        if at is None or at > now:
             self._wake.by(at)
             return False
         request = self.runner.next_request(now, [turn.request.node for turn in self._flight])

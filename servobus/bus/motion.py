@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -151,13 +151,24 @@ class Motion:
     async def stop(self) -> dict[str, StopReport]:
         """E-stop for this bus: everything that moves is dropped, every servo stops as its `on_estop` says (park: holds first)."""
         self.latched = True
-        return await self._stop(lambda record: record.options.on_estop, list(self._bus.records.values()))
+        return await self._stop(lambda record: record.options.on_estop, list(self._bus.records.values()), estop=True)
 
     async def limp(self, servos: Sequence[str]) -> dict[str, StopReport]:
-        """Torque off for these, ahead of everything."""
-        return await self._stop(lambda _: "limp", [self._bus.records[servo] for servo in servos])
+        """Torque off for these, ahead of everything that waits."""
+        records = [self._bus.records[servo] for servo in servos]
+        return await self._stop(lambda _: "limp", records, estop=self.latched or self.leaving)
 
-    async def _stop(self, kind_of: Callable[[ServoRecord], str], servos: Sequence[ServoRecord]) -> dict[str, StopReport]:
+    async def abandon(self, servos: Collection[str]) -> dict[str, StopReport]:
+        """Whoever moved these is gone: those that are enabled stop as their `on_lost_client` says (park: hold first), between two
+        plans of the others."""
+        gone = LeaseHeld("the client that moved it is gone: nothing was sent")
+        self._bus.scheduler.drop_goals(lambda servo: copy(gone).at(bus=self._bus.name, servo=servo), servos)
+        records = [self._bus.records[servo] for servo in servos if self._bus.records[servo].enabled]
+        return await self._stop(lambda record: record.options.on_lost_client, records, estop=False)
+
+    async def _stop(
+        self, kind_of: Callable[[ServoRecord], str], servos: Sequence[ServoRecord], *, estop: bool
+    ) -> dict[str, StopReport]:
         now = self._bus.clock()
         # Those that answer come first: a dead one must not hold up a live one.
         records = sorted(servos, key=lambda record: record.node.condition is not Condition.ONLINE)
@@ -174,13 +185,13 @@ class Motion:
         if not targets:
             return {}
         future: asyncio.Future[dict[str, StopReport]] = self._bus.loop.create_future()
-        job = Job(future, math.inf, plan=self._bus.driver.stop(targets), node=records[0].node.id, tries=1)
+        job = Job(future, math.inf, plan=self._bus.driver.stop(targets), node=records[0].node.id, tries=1, motion=not estop)
         for record, target in zip(records, targets, strict=True):
             record.setpoint = None
             if target.kind == "limp":
                 self._disable(record)  # before anything is said: no goal may leave behind the torque off
         try:
-            self._bus.master.submit_estop(job)
+            self._bus.master.submit_stop(job, estop=estop)
             reports = await future
         except ServobusError as error:
             if not future.done():
@@ -255,7 +266,7 @@ class Motion:
 
     async def leave(self) -> dict[str, StopReport]:
         """What `on_exit` says, hold and limp, for each servo whose torque may be on because of us; park is the rig's."""
-        return await self._stop(lambda record: record.options.on_exit, self.to_leave())
+        return await self._stop(lambda record: record.options.on_exit, self.to_leave(), estop=True)
 
     def to_leave(self) -> list[ServoRecord]:
         """The servos whose torque may be on because of us."""

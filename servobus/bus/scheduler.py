@@ -50,6 +50,8 @@ class Scheduler:
         self.profile = Profile(cycle, on_cut)
         self.requests = RequestQueue(limit)
         self.estop: deque[Job] = deque()
+        self.stops: deque[Job] = deque()
+        """Stops of single servos: before everything but an e-stop, and no plan is torn for them."""
         self.session: object = None
         """While set, polls, probes and goals rest and only this session's requests are served."""
         self.split_groups = 0
@@ -85,7 +87,14 @@ class Scheduler:
 
     def waiting(self) -> int:
         """Everything that waits, for people."""
-        return len(self.requests) + len(self.coalescer) + len(self._parked) + len(self.estop) + len(self._goal_jobs)
+        return (
+            len(self.requests)
+            + len(self.coalescer)
+            + len(self._parked)
+            + len(self.estop)
+            + len(self.stops)
+            + len(self._goal_jobs)
+        )
 
     # The decision
 
@@ -95,6 +104,8 @@ class Scheduler:
             self._end_parked(now)
         if self.estop:
             return self.estop.popleft()
+        if self.stops:
+            return self.stops.popleft()
         if self.session is not None:
             return self.requests.take(now, self.session)
         if self._only_requests(now):  # nearly always, where callers ask as fast as they can
@@ -186,6 +197,8 @@ class Scheduler:
         self.drop_goals(error)
         unwanted = self.requests.remove(lambda job: job.motion or not motion_only)
         unwanted += self._unpark(lambda job: job.motion or not motion_only)
+        unwanted += self.stops
+        self.stops.clear()
         if not motion_only:
             unwanted += self.estop
             self.estop.clear()

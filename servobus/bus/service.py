@@ -161,10 +161,14 @@ class BusService:
     # Reading
 
     async def read(self, servo: str, max_age: float | None = None) -> State:
-        record = self.records[servo]
-        if max_age is None or record.updated_at is None or self.clock() - record.updated_at > max_age:
+        if max_age is None or not self.knows(servo, max_age):
             self._updated(await self.ask(self.driver.read_state(servo), servo=servo))
         return self.state(servo)
+
+    def knows(self, servo: str, max_age: float) -> bool:
+        """The newest of what is known is no older than this (s)."""
+        heard = self.records[servo].updated_at
+        return heard is not None and self.clock() - heard <= max_age
 
     def state(self, servo: str) -> State:
         record = self.records[servo]

@@ -9,7 +9,8 @@ import pytest
 
 from servobus.config import parse_config
 from servobus.errors import ReplyTimeout
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.kst.device import KstDevice
 from servobus.sim.build import SimLink
 from tests.virtual import virtual
@@ -26,7 +27,7 @@ def config(duplex: str, *, delays: str = "[0, 0.5]", **keys: str):  # type: igno
 
 
 def link_of(rig: LocalRig) -> SimLink:
-    link = rig.links["line"]
+    link = rig.keepers["line"].link
     assert isinstance(link, SimLink)
     return link
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import uvloop
 
 from servobus.config import parse_config
-from servobus.local import open_rig
+from servobus.opening import open_rig
 from servobus.protocols.kst.codec import Command, encode
 from servobus.rig import Servo
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from servobus.config import Config, parse_config
 from servobus.errors import LinkDown, ServobusError
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.sim.build import simulated_line
 from servobus.sim.line import SimLine
 from servobus.sim.pty import SimPty

@@ -22,7 +22,7 @@ import scservo_sdk
 import uvloop
 
 from servobus.config import parse_config
-from servobus.local import open_rig
+from servobus.opening import open_rig
 from servobus.protocols.sms.codec import Instruction, SmsCodec, encode
 
 BAUDRATE = 1_000_000

@@ -27,7 +27,9 @@ from servobus.config import Config, load_config
 from servobus.doors.cli.tracing import Tracer
 from servobus.doors.cli.voice import Voice
 from servobus.errors import ConfigError, DeviceError
-from servobus.local import LocalRig, Trace, open_rig
+from servobus.keeper import Trace
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.table import PROTOCOLS
 from servobus.protocols.words import State
 from servobus.rig import full_name

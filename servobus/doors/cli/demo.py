@@ -15,7 +15,8 @@ from servobus.config import parse_config
 from servobus.doors.cli.common import Number, echo_table, emit, logs, run
 from servobus.doors.cli.offline import loads_of
 from servobus.errors import ServobusError
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.protocols.words import Outcome
 from servobus.rig import Servo
 

@@ -18,7 +18,7 @@ from ruamel.yaml.comments import CommentedMap
 from servobus.config import Config, parse_config
 from servobus.doors.cli.common import Options, echo_table, emit, logs, run, servo_options, simulated, traced
 from servobus.errors import ServobusError, UnknownName
-from servobus.local import open_rig
+from servobus.opening import open_rig
 from servobus.protocols.table import PROTOCOLS
 from servobus.rig import Found
 

@@ -13,7 +13,8 @@ import structlog
 from servobus.config import load_config
 from servobus.doors.cli.common import Number, logs
 from servobus.doors.cli.common import run as run_loop
-from servobus.local import LocalRig, open_rig
+from servobus.local import LocalRig
+from servobus.opening import open_rig
 from servobus.sim.serve import serve
 
 log = structlog.get_logger("servobus")

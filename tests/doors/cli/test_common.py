@@ -24,7 +24,7 @@ async def test_how_servos_were_left_is_told_when_nobody_confirms_it(options: Opt
     with pytest.raises(DeviceError, match=r"how it was left: arm/shoulder \(hold: .+\); look") as caught:  # noqa: PT012 - at the end
         async with opened(options, ["shoulder"]) as rig:
             await rig.enable("shoulder")
-            cast("SimLink", rig.links["arm"]).line.close()  # from here on nobody answers
+            cast("SimLink", rig.keepers["arm"].link).line.close()  # from here on nobody answers
     assert caught.value.exit_status == 1
 
 
@@ -32,7 +32,7 @@ async def test_what_went_wrong_before_is_told_first(options: Options) -> None:
     with pytest.raises(ValueError, match="first"):  # noqa: PT012 - it is raised by the last statement
         async with opened(options, ["shoulder"]) as rig:
             await rig.enable("shoulder")
-            cast("SimLink", rig.links["arm"]).line.close()
+            cast("SimLink", rig.keepers["arm"].link).line.close()
             raise ValueError("first")
 
 

@@ -1,0 +1,121 @@
+"""Motion leases: who may move a servo now. Pure: the time is given.
+
+A lease belongs to one connection and ends when it is not renewed in time, or with the connection. Both count as the loss of the
+client. A client that lost a lease must take it again in so many words: what it said before it learned of the loss moves nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable, Iterable
+from dataclasses import dataclass
+
+from servobus.errors import LeaseHeld
+
+
+@dataclass(slots=True)
+class _Holder:
+    label: str
+    """Its name, for messages."""
+    servos: set[str]
+    expires: float
+
+
+class Leases:
+    """By client (whatever tells one connection from another) and full servo name."""
+
+    def __init__(self, ttl: float) -> None:
+        self.ttl = ttl
+        """Seconds."""
+        self._holders: dict[Hashable, _Holder] = {}
+        self._owner: dict[str, Hashable] = {}
+        self._lost: dict[Hashable, set[str]] = {}
+        self._blocked: dict[str, str] = {}
+
+    def holders(self) -> dict[str, str]:
+        """Servo -> who holds it."""
+        return {servo: self._holders[client].label for servo, client in self._owner.items()}
+
+    def held_by(self, client: Hashable) -> set[str]:
+        holder = self._holders.get(client)
+        return set(holder.servos) if holder else set()
+
+    def check(self, client: Hashable, servos: Iterable[str]) -> None:
+        """Raises LeaseHeld when another client holds one of these."""
+        for servo in servos:
+            if servo in self._blocked:
+                raise LeaseHeld(self._blocked[servo], servo=servo)
+            owner = self._owner.get(servo, client)
+            if owner != client:
+                label = self._holders[owner].label
+                raise LeaseHeld(f"{label} moves it: wait until it is released; `stop` is always free", servo=servo)
+
+    def acquire(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
+        """Take it in so many words. All or none; raises LeaseHeld."""
+        self.check(client, servos)
+        self._lost.get(client, set()).difference_update(servos)
+        holder = self._holders.setdefault(client, _Holder(label, set(), now))
+        holder.servos.update(servos)
+        holder.expires = now + self.ttl
+        self._owner.update(dict.fromkeys(servos, client))
+
+    def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
+        """Take it by moving. Raises LeaseHeld, also for what this client lost and did not acquire again."""
+        lost = self._lost.get(client, set()).intersection(servos)
+        if lost:
+            raise LeaseHeld("its motion lease has expired, so this may be an old wish: acquire it again", servo=sorted(lost)[0])
+        self.acquire(client, label, servos, now)
+
+    def renew(self, client: Hashable, now: float) -> set[str]:
+        """What it holds, for another ttl."""
+        holder = self._holders.get(client)
+        if holder is None:
+            return set()
+        holder.expires = now + self.ttl
+        return set(holder.servos)
+
+    def release(self, client: Hashable, servos: Collection[str]) -> None:
+        """Given back: motion goes on to its end. What it does not hold is no error."""
+        holder = self._holders.get(client)
+        if holder is not None:
+            self._give_up(client, holder, holder.servos.intersection(servos))
+
+    def gone(self, client: Hashable) -> set[str]:
+        """The connection is closed: what it still held."""
+        self._lost.pop(client, None)
+        holder = self._holders.get(client)
+        return self._give_up(client, holder, set(holder.servos)) if holder else set()
+
+    def expire(self, now: float) -> dict[Hashable, set[str]]:
+        """Who was silent for too long, and what each has lost."""
+        lost = {}
+        for client, holder in list(self._holders.items()):
+            if holder.expires <= now:
+                lost[client] = self._give_up(client, holder, set(holder.servos))
+                self._lost.setdefault(client, set()).update(lost[client])
+        return lost
+
+    def next_expiry(self) -> float | None:
+        return min((holder.expires for holder in self._holders.values()), default=None)
+
+    def block(self, servos: Iterable[str], reason: str) -> None:
+        """Nobody gets these until they are unblocked: they are being stopped or parked."""
+        self._blocked.update(dict.fromkeys(servos, reason))
+
+    def unblock(self, servos: Iterable[str]) -> None:
+        for servo in servos:
+            self._blocked.pop(servo, None)
+
+    def forget(self, servos: Iterable[str]) -> None:
+        """They are not in the config any more."""
+        for servo in servos:
+            client = self._owner.get(servo)
+            if client is not None:
+                self._give_up(client, self._holders[client], {servo})
+
+    def _give_up(self, client: Hashable, holder: _Holder, servos: set[str]) -> set[str]:
+        holder.servos -= servos
+        for servo in servos:
+            self._owner.pop(servo, None)
+        if not holder.servos:
+            self._holders.pop(client, None)
+        return servos
