@@ -41,7 +41,6 @@ class Node:
         "configured",
         "enabled",
         "greatest_deadline",
-        "heard_at",
         "id",
         "misses",
         "next_probe",
@@ -62,7 +61,6 @@ class Node:
         self.misses = 0
         self.backoff = 0.0
         self.next_probe = 0.0
-        self.heard_at: float | None = None
         self._mean: float | None = None
         self._spread = 0.0
         self._deadline = min(FIRST_DEADLINE, greatest_deadline)
@@ -84,10 +82,9 @@ class Node:
         wanted = self._mean + 4 * self._spread
         self._deadline = min(max(wanted, LEAST_DEADLINE), self.greatest_deadline)
 
-    def answered(self, status: int | None, now: float) -> None:
+    def answered(self, status: int | None) -> None:
         """It gave an answer that was believed."""
         self.status = status
-        self.heard_at = now
         self.misses = 0
 
     def doubt(self, key: Hashable, asked_at: float) -> None:

@@ -253,7 +253,7 @@ class BusMaster(asyncio.Protocol):
         self._stats.turns.add(now - turn.sent_at)
         if not self._flight:
             self.line.answered(now, turn.request.quiet_after)
-        self.runner.answered(turn, now, self._latency(turn, now))
+        self.runner.answered(turn, self._latency(turn, now))
         self._go_on(now)
 
     def _missed(self, turn: Turn, now: float) -> None:

@@ -106,11 +106,11 @@ class Runner:
         assert self._run is not None
         self._resolve(self._run, request.parse(()))
 
-    def answered(self, turn: Turn, now: float, latency: float) -> None:
+    def answered(self, turn: Turn, latency: float) -> None:
         """All answers are here."""
         for reply in turn.replies:
             node = self.health.node(reply.node)
-            node.answered(reply.status, now)
+            node.answered(reply.status)
             node.learn(latency)
         self._conclude(turn)
 
@@ -123,7 +123,7 @@ class Runner:
             self.health.missed(self.health.node(node_id), request.reply_key, turn.sent_at, now)
         if request.partial and turn.replies and not rejected:
             for reply in turn.replies:  # how soon they came is not known: the deadline ended this turn
-                self.health.node(reply.node).answered(reply.status, now)
+                self.health.node(reply.node).answered(reply.status)
             self._conclude(turn)
         else:
             self._again(turn, now)

@@ -127,7 +127,7 @@ class StopTarget:
     servo: str
     kind: Literal["hold", "limp"]
     enabled: bool
-    """Enabled by us; None is not known here: an unenabled servo is asked before it is held."""
+    """Enabled by us; one that is not is asked whether its torque is on before it is held."""
     position: float | None = None
     """The present position, if it is fresh enough to be written at once."""
     reachable: bool = True

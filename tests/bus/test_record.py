@@ -54,7 +54,7 @@ def test_the_goal_is_our_setpoint_else_what_the_servo_says(record: ServoRecord) 
 def test_the_status_is_that_of_the_last_reply_else_what_was_read(record: ServoRecord) -> None:
     record.update({"status": 4}, 10.0)
     assert record.state(10.0, ()).status == 4
-    record.node.answered(0, 11.0)
+    record.node.answered(0)
     assert record.state(11.0, ()).status == 0
 
 

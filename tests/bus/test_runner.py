@@ -69,7 +69,10 @@ class Rig(Bench):
         believed = judge(codec, turn, strays)
         if strays:
             self.runner.strays(strays, turn, self.now)
-        (self.runner.answered if believed else self.runner.missed)(turn, self.now, latency)
+        if believed:
+            self.runner.answered(turn, latency)
+        else:
+            self.runner.missed(turn, self.now, latency)
         return turn
 
     def answer(self, value: int = 0) -> bytes:
@@ -129,7 +132,6 @@ def test_a_request_is_said_and_its_caller_told() -> None:
     assert rig.runner.idle
     assert rig.answer(42) == ask(5)
     assert (told, rig.runner.idle, rig.next()) == ([42], True, b"")
-    assert rig.node(1).heard_at == rig.now
 
 
 def test_what_nobody_answers_is_done_when_it_is_sent() -> None:
@@ -322,7 +324,6 @@ def test_a_group_read_believes_who_answered_and_doubts_who_did_not() -> None:
     assert told == [{1: 10, 3: 30}]
     assert [rig.node(number).condition for number in (1, 2, 3)] == ["online", "doubtful", "online"]
     assert rig.node(1).deadline == before == FIRST_DEADLINE, "those who answered do not pay for the one who did not"
-    assert rig.node(1).heard_at == rig.now
 
 
 def test_a_group_read_nobody_answered_is_a_miss() -> None:

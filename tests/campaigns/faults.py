@@ -1,7 +1,8 @@
 """A faulty line in virtual time: how many values were wrong, how many awaits hung, how many tasks were left behind.
 
 `faults` damages one reply in a hundred in every way there is; `cancel` cancels callers at random points of a faulty line. The
-values come from an oracle, so every wrong one is seen. A hung await ends the campaign: the virtual loop notices when all wait.
+values come from an oracle, so every wrong one is seen. An await that takes longer than any turn may wait counts as hung, and one
+that never ends ends the campaign: the virtual loop notices when all wait.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import random
 from dataclasses import dataclass, field
 from typing import Literal
 
-from servobus.bus.service import BusService
+from servobus.bus.service import PATIENCE, BusService
 from servobus.errors import ServobusError
 from servobus.protocols.options import FaultOptions
 from tests.campaigns.oracle import SERVOS, Oracle, service
@@ -20,6 +21,8 @@ from tests.virtual import VirtualLoop
 KINDS = ("loss", "late", "duplicate", "truncate", "drop_byte", "insert_byte", "flip", "wrong_id", "echo")
 LATE_MS = 100.0
 """Five times the deadline that a node begins with."""
+HUNG = PATIENCE + 1.0
+"""Seconds after which every call has ended: its turn came within the patience, or it failed."""
 
 
 @dataclass(slots=True)
@@ -30,6 +33,7 @@ class Result:
     wrong: int = 0
     timeouts: int = 0
     cancelled: int = 0
+    hung: int = 0
     turns: int = 0
     leaked: int = 0
     waiting: int = 0
@@ -38,7 +42,7 @@ class Result:
     def report(self, title: str) -> None:
         print(
             f"{title}: {self.turns} turns, {self.reads} values, {self.wrong} wrong, {self.timeouts} timeouts, "
-            f"{self.cancelled} cancelled, 0 hung, {self.leaked} leaked tasks, {self.waiting} still queued"
+            f"{self.cancelled} cancelled, {self.hung} hung, {self.leaked} leaked tasks, {self.waiting} still queued"
         )
         print("   " + ", ".join(f"{name} {count}" for name, count in sorted(self.counts.items())))
 
@@ -79,7 +83,8 @@ async def _faults(reads: int, protocol: str, damage: FaultOptions, seed: int) ->
 
 async def _read(bus: BusService, oracle: Oracle, rng: random.Random, result: Result, node: int) -> None:
     register = oracle.register(rng)
-    asked = asyncio.get_running_loop().time()
+    clock = asyncio.get_running_loop().time
+    asked = clock()
     try:
         value = await bus.read_register(f"s{node}", register, raw=True)
     except ServobusError:
@@ -87,6 +92,7 @@ async def _read(bus: BusService, oracle: Oracle, rng: random.Random, result: Res
     else:
         result.reads += 1
         result.wrong += not oracle.right(value, node, register, asked)
+    result.hung += clock() - asked > HUNG
 
 
 async def _end(bus: BusService, result: Result) -> Result:

@@ -12,7 +12,7 @@ from tests.campaigns.oracle import ORACLES
 
 
 def assert_right(result: Result) -> None:
-    assert (result.wrong, result.leaked, result.waiting) == (0, 0, 0)
+    assert (result.wrong, result.hung, result.leaked, result.waiting) == (0, 0, 0, 0)
 
 
 @pytest.mark.parametrize(("protocol", "seed"), [("sms", 1), ("sms", 2), ("kst", 1), ("kst", 2)])
