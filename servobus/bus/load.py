@@ -40,6 +40,7 @@ class Load:
 
 def wire_load(options: BusOptions, driver: Driver, traits: LineTraits) -> Load:
     """Goals of all servos at the bus's `goal_rate`, polls at theirs."""
+    driver.carries(traits)
     goals = _goal_requests(options, driver)
     shares = {"goals": 100 * options.rate_of_goals * _seconds(goals, traits)}
     longest = max((_seconds([request], traits) for request in goals), default=0.0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
 from servobus.bus.coalescer import Coalescer, Group, Ticket
@@ -18,12 +19,14 @@ from servobus.bus.grid import PollGrid
 from servobus.bus.health import Condition, Health, Node
 from servobus.bus.profile import Profile
 from servobus.bus.queue import Callback, Job, RequestQueue, overloaded
-from servobus.errors import ReplyTimeout, ServobusError
+from servobus.errors import DeviceError, ReplyTimeout, ServobusError
 from servobus.protocols.base import Driver, GoalTurn, Plan
 from servobus.protocols.words import Outcome
 
 QUEUE_LIMIT = 1024
 """Jobs that may wait on one bus."""
+PROBE_PAUSE = 0.1
+"""Seconds until a node is asked again that answers a probe, but not as it should."""
 POLL_PATIENCE = 1.0
 """Seconds after which a poll that could not be sent is not wanted any more."""
 
@@ -267,7 +270,13 @@ class Scheduler:
         node = self.health.due_probe(now)
         if node is None:
             return None
-        return Job(Callback(_ignore), now + POLL_PATIENCE, plan=self.recovery(node), node=node.id, recovery=True)
+        return Job(
+            Callback(partial(_probed, node, now + PROBE_PAUSE)),
+            now + POLL_PATIENCE,
+            plan=self.recovery(node),
+            node=node.id,
+            recovery=True,
+        )
 
     def recovery(self, node: Node) -> Plan[bool]:
         """The fence, and whether the servo still is as we left it. What makes a doubtful node believed again."""
@@ -284,5 +293,7 @@ def _settle(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | 
         ticket.done(result[ticket.servo] if isinstance(result, dict) else result)
 
 
-def _ignore(_: object) -> None:
-    """A probe's outcome stands in the node's health."""
+def _probed(node: Node, later: float, result: object) -> None:
+    """A probe's outcome stands in the node's health; one that was refused is not asked again at once."""
+    if isinstance(result, DeviceError):
+        node.next_probe = max(node.next_probe, later)

@@ -12,15 +12,16 @@ from contextlib import asynccontextmanager
 from typing import Any, TypeVar, cast
 
 from servobus.bus.health import Condition, Health, Node
+from servobus.bus.introduction import Introduction
 from servobus.bus.line import EchoFilter, Line
 from servobus.bus.master import BusMaster
 from servobus.bus.motion import Motion
-from servobus.bus.queue import TRIES, Callback, Job
+from servobus.bus.queue import TRIES, Job
 from servobus.bus.record import ServoRecord
 from servobus.bus.runner import Runner
 from servobus.bus.scheduler import Scheduler
 from servobus.bus.stats import BusStats
-from servobus.errors import LeaseHeld, LinkDown, NotSupported, ReplyTimeout, ServobusError
+from servobus.errors import DeviceError, LeaseHeld, NotSupported, ServobusError
 from servobus.protocols.base import Codec, Commissioning, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
 from servobus.protocols.words import Change, Identity, State, Update
@@ -31,8 +32,6 @@ R = TypeVar("R")
 PATIENCE = 2.0
 """Seconds a request may wait for its turn."""
 TOLERANCE_STEPS = 10
-INTRODUCTION_PAUSE = 1.0
-"""Seconds between two attempts to learn who a servo is that answers, but not to that."""
 DOWN_PAUSE = 0.02
 """A caller that asks again and again while the line is down is answered this slowly, so that it does not burn the core."""
 
@@ -70,39 +69,21 @@ class BusService:
         for servo, entry in servos.items():
             self.records[servo] = ServoRecord(servo, entry, self.health.node(driver.nodes[servo]))
         self.motion = Motion(self)
+        self.introduction = Introduction(self)
 
     # Start and end
 
     async def start(self) -> None:
         """After the line was opened: quiet, identify, read; then poll. Writes nothing. A missing servo is an event, no error."""
         if self.options.echo == "auto":
-            await self._probe_echo()
-        await asyncio.gather(*(self._introduce(record) for record in self.records.values()))
+            await self.introduction.probe_echo()
+        self.driver.carries(self.line.traits)
+        await self.introduction.everyone()
         if self.master.up and self.motion.latched:
             await self.motion.stop()  # asked for while the line was down
         if self.master.up:
             self.scheduler.polls.set(self.driver.polls(self.options.poll.rates()), self.clock())
             self.master.goals_waiting()
-
-    async def _probe_echo(self) -> None:
-        """A question nobody answers: what is heard is our own voice."""
-        before = self.stats.counts["echoes"]
-        try:
-            await self.ask(self.driver.unused(), tries=1)
-        except ReplyTimeout:
-            pass
-        except LinkDown:
-            return
-        if self.stats.counts["echoes"] > before:
-            self.line.echo = EchoFilter()
-        self.event("echo_probed", bus=self.name, echo="on" if self.line.echo else "off")
-
-    async def _introduce(self, record: ServoRecord) -> None:
-        try:
-            await self.identify(record.name)
-            await self.read(record.name)
-        except ServobusError as error:
-            self.event("servo_missing", bus=self.name, servo=record.name, id=record.node.id, reason=error.message)
 
     # Requests and plans
 
@@ -151,7 +132,20 @@ class BusService:
         try:
             return await cast("asyncio.Future[Any]", job.sink)
         except ServobusError as error:
-            raise error.at(bus=self.name, servo=servo) from None
+            failure = error.at(bus=self.name, servo=servo)
+        if isinstance(failure, DeviceError) and job.plan is None and servo is not None:
+            failure = await self._explained(failure, servo)
+        raise failure
+
+    async def _explained(self, error: DeviceError, servo: str) -> ServobusError:
+        """With what the servo says about its refusal, where it can be asked."""
+        plan = self.driver.explain(servo, error)
+        if plan is None:
+            return error
+        try:
+            return (await self.perform(plan, self.driver.nodes[servo], servo=servo)).at(bus=self.name, servo=servo)
+        except ServobusError:
+            return error
 
     def set_baudrate(self, baudrate: int) -> None:
         """For an exclusive session."""
@@ -207,14 +201,8 @@ class BusService:
 
     async def identify(self, servo: str) -> Identity:
         identity = await self.perform(self.driver.identify(servo), self.driver.nodes[servo], servo=servo, urgent=True)
-        self._introduced(self.records[servo], identity)
+        self.introduction.met(self.records[servo], identity)
         return identity
-
-    def _introduced(self, record: ServoRecord, identity: Identity) -> None:
-        if record.identity != identity:
-            for note in identity.notes:
-                self.event("servo_note", bus=self.name, servo=record.name, note=note)
-        record.identity = identity
 
     # Sessions
 
@@ -271,21 +259,7 @@ class BusService:
         names = [record.name for record in self.on(node)]
         if Condition.OFFLINE in (node.condition, before):
             self.event(f"servo_{node.condition}", bus=self.name, servo=",".join(names), id=node.id)
-        now = self.clock()
-        for record in self.on(node):
-            if node.condition is Condition.ONLINE and record.identity is None and now >= record.introduce_after:
-                record.introduce_after = now + INTRODUCTION_PAUSE
-                self._introduce_later(record)
-
-    def _introduce_later(self, record: ServoRecord) -> None:
-        """A servo that was missing at the start has appeared."""
-
-        def introduced(result: Identity | Exception) -> None:
-            if isinstance(result, Identity):
-                self._introduced(record, result)
-
-        job = Job(Callback(introduced), self.clock() + PATIENCE, plan=self.driver.identify(record.name), node=record.node.id)
-        self.scheduler.requests.put(job)
+        self.introduction.changed(node, self.clock())
 
     def on(self, node: Node) -> list[ServoRecord]:
         """The servos of a node."""

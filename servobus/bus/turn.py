@@ -41,7 +41,7 @@ class Turn:
 
     def offer(self, reply: Reply) -> bool:
         """Take a valid frame; False: it is a stray."""
-        if reply.frame == self.request.frame:
+        if reply.frame == self.request.frame and not self.request.mirrored:
             self.echoes += 1
             return True
         if len(self.replies) >= self.request.replies or not self.request.answers(reply):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Generator, Hashable, Mapping, 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
+from servobus.errors import DeviceError
 from servobus.protocols.words import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
@@ -82,6 +83,8 @@ class Request(ABC, Generic[R]):
     """Seconds of silence that must follow."""
     service_time: float = 0.0
     """Seconds the device may need beyond its usual delay (flash write, reboot)."""
+    mirrored: bool = False
+    """The right answer is the request itself, said back: only for lines known to have no echo."""
     partial: bool = False
     """Fewer replies than due are a result too: the nodes that are missing become doubtful, the others are believed."""
 
@@ -190,6 +193,12 @@ class Driver(Protocol):
     def commissioning(self) -> Commissioning | None:
         """None: this protocol's servos are given ids and rates with other tools."""
 
+    def carries(self, traits: LineTraits) -> None:
+        """What the line carries, told before it is spoken on."""
+
+    def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError] | None:
+        """What a servo that refused can still be asked, as the error to raise instead. None: nothing."""
+
     def step(self, servo: str) -> float:
         """The size of one raw step in the servo's unit."""
 
@@ -241,6 +250,16 @@ class Driver(Protocol):
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
         """The words for a health byte."""
+
+
+class PlainDriver:
+    """What drivers share whose frames fit every line, and whose servos tell in their refusal all they know."""
+
+    def carries(self, traits: LineTraits) -> None:
+        """Whatever it carries."""
+
+    def explain(self, servo: str, error: DeviceError) -> None:
+        """Nothing more can be asked."""
 
 
 @dataclass(frozen=True, slots=True)

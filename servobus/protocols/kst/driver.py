@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
-from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalTurn, PlainDriver, Plan, Poll, Request, ask
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
 from servobus.protocols.kst.commission import Commissioning
@@ -29,7 +29,7 @@ VERBS = {"goal_position": "use move", "id": "use commissioning (set_id)", "baud_
 """Registers that another verb writes."""
 
 
-class KstDriver:
+class KstDriver(PlainDriver):
     """See `protocols.base.Driver`."""
 
     def __init__(self, options: KstBus, models: Mapping[str, KstModel]) -> None:

@@ -169,16 +169,14 @@ class Write(ModbusRequest[None]):
 
 
 class WriteSingle(Write):
-    """0x06: one register. Its right answer is the question itself, so `plain` asks again with 0x10."""
+    """0x06: one register. Its right answer is the question itself, so it is only for lines without an echo."""
+
+    mirrored = True
 
     def __init__(self, wire: Wire, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
         body = pack((address, value))
         super().__init__(wire, unit, Function.WRITE_SINGLE, body, body, WRITE_SIZE)
         self.idempotent = repeat
-        self._again = (wire, unit, address, (value,))
-
-    def plain(self) -> Request[None] | None:
-        return WriteMultiple(*self._again) if self.idempotent else None
 
 
 class WriteMultiple(Write):

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, ServobusError, UnknownName
-from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalTurn, LineTraits, Plan, Poll, Request, ask
 from servobus.protocols.modbus.codec import MAX_UNIT, Function
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, Probe, Wire
 from servobus.protocols.roh import goals, stop
@@ -42,7 +42,7 @@ class RohDriver:
     def __init__(self, options: RohBus, models: Mapping[str, RohModel]) -> None:
         self.options = options
         self.wire = Wire.at(options.baudrate, options.turnaround_ms / 1000)
-        self.limits = Limits(options.read_limit, options.write_limit)
+        self.limits = Limits(*options.limits(LineTraits()))
         self.fingers = {name: Finger(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: finger.node for name, finger in self.fingers.items()}
         self._models = models
@@ -67,6 +67,14 @@ class RohDriver:
     @property
     def commissioning(self) -> None:
         """A hand's unit id belongs to all its fingers: see `unit_plans`."""
+
+    def carries(self, traits: LineTraits) -> None:
+        self.limits.read, self.limits.write = self.options.limits(traits)
+        self._reads.clear()
+
+    def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError]:
+        """A device failure has a reason, which the hand keeps in a register (seed 3.4)."""
+        return self._of(servo)[1].explain(error)
 
     def step(self, servo: str) -> float:
         return self.fingers[servo].step

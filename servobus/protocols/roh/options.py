@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from servobus.protocols.base import LineTraits
 from servobus.protocols.modbus.codec import MAX_READ, MAX_UNIT, MAX_WRITE
 from servobus.protocols.model import Data
 from servobus.protocols.options import BusOptions, Name, ServoOptions
@@ -17,9 +18,6 @@ Map = Literal["legacy", "v1", "v2"]
 MAPS: tuple[Map, ...] = ("legacy", "v1", "v2")
 
 ALWAYS_HOLDS = "a ROH hand has no torque command, so nothing can make a finger limp: it always holds. Use hold"
-TUNNEL = "realman:"
-TUNNEL_READ, TUNNEL_WRITE = 12, 10
-"""Registers a RealMan arm of generation 2 or 3 passes on in one call."""
 USUAL = 64
 """Registers of one question; the hand's own limit is documented nowhere."""
 
@@ -66,9 +64,9 @@ class RohBus(BusOptions):
     units: dict[Unit, UnitOptions] = {}
     """Hands whose map is pinned; all others are `auto`."""
     max_read: Annotated[int, Field(ge=1, le=MAX_READ)] | None = None
-    """Registers of one read; 64 if omitted, 12 through a RealMan arm."""
+    """Registers of one read; 64 if omitted, and never more than the line carries (a RealMan arm of generation 2 or 3: 12)."""
     max_write: Annotated[int, Field(ge=1, le=MAX_WRITE)] | None = None
-    """Registers of one write; 64 if omitted, 10 through a RealMan arm."""
+    """Registers of one write; 64 if omitted, and never more than the line carries (such an arm: 10)."""
     single_write: Literal["multiple", "single"] = "multiple"
     """How one register is written. single (0x06): its answer looks like an echo, so only for lines that have none."""
     turnaround_ms: Annotated[float, Field(ge=0, le=10_000)] = 100.0
@@ -89,10 +87,10 @@ class RohBus(BusOptions):
     def map_of(self, unit: int) -> str:
         return self.units[unit].model if unit in self.units else "auto"
 
-    @property
-    def read_limit(self) -> int:
-        return self.max_read or (TUNNEL_READ if self.port.startswith(TUNNEL) else USUAL)
+    def limits(self, traits: LineTraits) -> tuple[int, int]:
+        """Registers of one read and of one write, over such a line."""
+        return _least(self.max_read or USUAL, traits.max_read), _least(self.max_write or USUAL, traits.max_write)
 
-    @property
-    def write_limit(self) -> int:
-        return self.max_write or (TUNNEL_WRITE if self.port.startswith(TUNNEL) else USUAL)
+
+def _least(wanted: int, carried: int | None) -> int:
+    return wanted if carried is None else min(wanted, carried)

@@ -12,9 +12,9 @@ WORTHWHILE = 26
 """Words nobody asked for that cost as much as one more turn at 115200 baud: 13 bytes and two silences of 1.75 ms."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Limits:
-    """Registers that the line carries in one question."""
+    """Registers that the line carries in one question; known for sure when it is up."""
 
     read: int
     write: int

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError, UnknownName
-from servobus.protocols.base import GoalTurn, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalTurn, PlainDriver, Plan, Poll, Request, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
@@ -29,7 +29,7 @@ COMMISSIONING = frozenset({"id", "baud_rate", "response_status_level"})
 SPAN = re.compile(r"(0[xX][0-9a-fA-F]+|\d+):(\d+)")
 
 
-class SmsDriver:
+class SmsDriver(PlainDriver):
     """See `protocols.base.Driver`."""
 
     def __init__(self, options: SmsBus, models: Mapping[str, SmsModel]) -> None:

@@ -124,11 +124,9 @@ def test_the_echo_of_a_write_of_many_is_no_answer() -> None:
     assert asked.plain() is None
 
 
-def test_a_single_write_that_was_echoed_is_said_in_a_form_whose_echo_is_none() -> None:
-    again = WriteSingle(WIRE, 2, 1135, 9).plain()
-    assert isinstance(again, WriteMultiple)
-    assert again.frame == WriteMultiple(WIRE, 2, 1135, [9]).frame
-    assert WriteSingle(WIRE, 2, 1135, 9, repeat=False).plain() is None
+def test_only_a_single_write_is_answered_by_itself() -> None:
+    assert WriteSingle(WIRE, 2, 1135, 9).mirrored
+    assert not WriteMultiple(WIRE, 2, 1135, [9]).mirrored
 
 
 @given(st.integers(1, MAX_READ), st.integers(1, MAX_READ))

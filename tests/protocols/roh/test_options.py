@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from servobus.errors import ConfigError, LimitError, UnknownName
+from servobus.protocols.base import LineTraits
 from servobus.protocols.roh import ENTRY
 from servobus.protocols.roh.load import FILES, load_models, packaged_models
 from servobus.protocols.roh.model import CHANNELS, RohModel
@@ -62,11 +63,11 @@ def test_a_finger_is_unique_by_unit_and_channel() -> None:
 def test_defaults() -> None:
     options = bus_options({}, units={9: {"model": "v1"}})
     assert (options.baudrate, options.map_of(9), options.map_of(2)) == (115_200, "v1", "auto")
-    assert (options.read_limit, options.write_limit) == (64, 64)
-    arm = bus_options(port="realman://192.0.2.10:8080?port=1")
-    assert (arm.read_limit, arm.write_limit) == (12, 10)
-    four = bus_options(port="realman://192.0.2.10:8080?port=1", max_read=100, max_write=100)
-    assert (four.read_limit, four.write_limit) == (100, 100)
+    assert options.limits(LineTraits()) == (64, 64)
+    assert options.limits(LineTraits(max_read=12, max_write=10)) == (12, 10)
+    asked = bus_options({}, max_read=100, max_write=5)
+    assert asked.limits(LineTraits()) == (100, 5)
+    assert asked.limits(LineTraits(max_read=12, max_write=10)) == (12, 5)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
-from servobus.protocols.base import run_plan
+from servobus.protocols.base import LineTraits, run_plan
 from servobus.protocols.modbus.requests import WriteSingle
 from servobus.protocols.roh.model import CHANNELS
 from tests.protocols.roh.simulated import Bench, bench_of, goal
@@ -47,7 +47,8 @@ def test_feedback_is_one_read_and_health_the_fewest(name: str) -> None:
 
 
 def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
-    bench = Bench(port="realman://h:1")
+    bench = Bench()
+    bench.driver.carries(LineTraits(max_read=12, max_write=10))
     bench.enable()
     reads = [poll.request([2]) for poll in bench.driver.polls({"feedback": 50, "health": 5})]
     assert [request.frame[5] for request in reads if request] == [6, 6, 6]
