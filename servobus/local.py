@@ -266,6 +266,9 @@ class LocalRig(Rig):
     async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
         return await self._bus(bus).commission(node, lambda plans: plans.set_baudrate(node, baudrate, save=save))
 
+    async def command(self, bus: str, node: int, name: str, value: int | None = None) -> tuple[str, ...]:
+        return await self._bus(bus).commission(node, lambda plans: plans.command(node, name, value))
+
     def _bus(self, name: str) -> BusService:
         if name not in self.buses:
             raise UnknownName(f"no bus {name!r}: there are {', '.join(self.buses)}")

@@ -252,6 +252,12 @@ class Rig(ABC):
         """Give the servo at this id another baud rate, likewise. KST 3.1, 3.3."""
 
     @abstractmethod
+    async def command(self, bus: str, node: int, name: str, value: int | None = None) -> tuple[str, ...]:
+        """Tell the servo or hand at this id to restart, save, recalibrate ...: what its protocol's documents have, said once.
+        Nothing on the bus may be enabled. Returns what a person should know. Raises UnknownName (and lists what there is),
+        NotSupported, LimitError, LeaseHeld, DeviceError."""
+
+    @abstractmethod
     def stats(self) -> dict[str, Any]:
         """Counters and latencies of each bus, and the condition of each node."""
 

@@ -10,10 +10,11 @@ from servobus.opening import open_rig
 from servobus.protocols.words import Outcome
 from tests.virtual import virtual
 
-KEYS = "limits: [-60, 60], max_speed: 90"
+KEYS = "limits: [-45, 45], max_speed: 90"
 JOINTS = {
     "sms": f"    protocol: sms\n    baudrate: 1000000\n    servos: {{joint: {{id: 1, model: sts, {KEYS}}}}}\n",
     "kst": f"    protocol: kst\n    baudrate: 512000\n    servos: {{joint: {{id: 37, {KEYS}}}}}\n",
+    "roh": f"    protocol: roh\n    baudrate: 115200\n    servos: {{joint: {{id: 2, channel: index, zero: 32768, {KEYS}}}}}\n",
 }
 
 
@@ -27,7 +28,7 @@ async def test_one_app_for_every_joint(protocol: str) -> None:
             await joint.move_to(10)
         await joint.enable()
         with pytest.raises(LimitError):
-            await joint.move_to(60.1)
+            await joint.move_to(45.1)
         assert await joint.move_to(30) is Outcome.ACKED
         state = await joint.settle()
         assert state.position == pytest.approx(30, abs=1)
@@ -51,7 +52,7 @@ async def test_a_led_servo_keeps_its_speed_and_stops_where_it_is() -> None:
     async with open_rig(parse_config(text, "app")) as rig:
         joint = rig["joint"]
         await joint.enable()
-        await joint.move_to(60, speed=30)
+        await joint.move_to(45, speed=30)
         places: list[float] = []
         async for snapshot in rig.watch(hz=20):
             position = snapshot["line/joint"].position

@@ -92,7 +92,31 @@ KST_ORDER = (
     "clear",
 )
 KST_SERVOS = ("s1: {id: 1, limits: [-80, 80]}", "s2: {id: 2}", "s3: {id: 3}")
-PROTOCOLS = {"sms": VERBS, "kst": {name: KST_VERBS[name] for name in KST_ORDER}}
+ROH_VERBS: dict[str, Verb] = {
+    "ping": (lambda rig: rig.ping("s1"), lambda status: status is None),
+    "identify": (lambda rig: rig.identify("s2"), lambda found: (found.model, found.firmware) == ("v2", "3.1.155")),
+    "read": (lambda rig: rig.read("s1"), lambda state: state.position == 0),
+    "read_register": (lambda rig: rig.read_register("s2", "node_id"), lambda value: value == 2),
+    "read_span": (lambda rig: rig.read_register("s3", "1005:1"), lambda value: value == [2]),
+    "write_register": (lambda rig: rig.write_register("s2", "stall_speed", 20), lambda value: value == 20),
+    "persist": (lambda rig: rig.write_register("s3", "beep_switch", 0, persist=True), lambda value: value == 0),
+    "scan": (lambda rig: rig.scan("arm", ids=range(1, 4)), lambda found: [hit.id for hit in found] == [2]),
+    "enable": VERBS["enable"],
+    "write": VERBS["write"],
+    "sync_write": (lambda rig: rig.move({"s1": 45, "s2": 55}), lambda results: set(results.values()) == {Outcome.ACKED}),
+    "reg_write": (
+        lambda rig: rig.move({"s1": 42, "s2": 58}, together=True, confirm=True),
+        lambda results: set(results.values()) == {Outcome.ACKED},
+    ),
+    "settle": (
+        lambda rig: rig.settle("s1", "s2"),
+        lambda states: all(abs(abs(state.position - 50) - 8) < 1 for state in states.values()),
+    ),
+    "stop": VERBS["stop"],
+    "clear": VERBS["clear"],
+}
+ROH_SERVOS = ("s1: {id: 2, channel: index}", "s2: {id: 2, channel: middle}", "s3: {id: 2, channel: little}")
+PROTOCOLS = {"sms": VERBS, "kst": {name: KST_VERBS[name] for name in KST_ORDER}, "roh": ROH_VERBS}
 
 LOSSY: dict[str, Callable[[Any], bool]] = {
     "scan": lambda found: {hit.id for hit in found} <= {1, 2, 3},
@@ -104,7 +128,10 @@ LOSSY: dict[str, Callable[[Any], bool]] = {
 
 def _config(protocol: str, delivery: Delivery) -> Config:
     keys = {"faults": delivery.faults, "echo": delivery.echo, "poll": "{feedback: 50}"}
-    return config(**keys) if protocol == "sms" else config(*KST_SERVOS, protocol="kst", baudrate="512000", **keys)
+    if protocol == "sms":
+        return config(**keys)
+    servos, baudrate = {"kst": (KST_SERVOS, "512000"), "roh": (ROH_SERVOS, "115200")}[protocol]
+    return config(*servos, protocol=protocol, baudrate=baudrate, **keys)
 
 
 async def _every_verb(rig: LocalRig, protocol: str, delivery: Delivery) -> None:

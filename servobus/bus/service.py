@@ -24,7 +24,7 @@ from servobus.bus.stats import BusStats
 from servobus.errors import DeviceError, LeaseHeld, NotSupported, ServobusError
 from servobus.protocols.base import Codec, Commissioning, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
-from servobus.protocols.words import Change, Identity, State, Update
+from servobus.protocols.words import Identity, State, Update
 from servobus.timerfd import clock_of
 
 R = TypeVar("R")
@@ -191,8 +191,10 @@ class BusService:
         return self.ask(self.driver.read_register(servo, register, raw=raw), servo=servo)
 
     async def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
-        if persist and self.records[servo].enabled:
-            raise NotSupported("EEPROM is written to disabled servos only: disable it first", bus=self.name, servo=servo)
+        enabled = [record.name for record in self.on(self.records[servo].node) if record.enabled]
+        if persist and enabled:
+            message = f"what stays is written to disabled servos only: disable {', '.join(enabled)} first"
+            raise NotSupported(message, bus=self.name, servo=servo)
         plan = self.driver.write_register(servo, register, value, raw=raw, persist=persist)
         return await self.perform(plan, self.driver.nodes[servo], servo=servo)
 
@@ -221,9 +223,9 @@ class BusService:
             if self.master.up:
                 self.master.goals_waiting()
 
-    async def commission(self, node: int, plan_of: Callable[[Commissioning], Plan[Change]]) -> Change:
-        """A change of id or rate, alone on the line and with nothing enabled. Raises NotSupported, LeaseHeld, LimitError,
-        DeviceError."""
+    async def commission(self, node: int, plan_of: Callable[[Commissioning], Plan[R]]) -> R:
+        """A change of id or rate, or a command, alone on the line and with nothing enabled. Raises NotSupported, LeaseHeld,
+        LimitError, DeviceError."""
         if self.driver.commissioning is None:
             raise NotSupported("servos of this bus are given ids and rates with the vendor's tool", bus=self.name)
         plan = plan_of(self.driver.commissioning)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Generator, Hashable, Mapping, 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
-from servobus.errors import DeviceError
+from servobus.errors import DeviceError, UnknownName
 from servobus.protocols.words import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
@@ -180,6 +180,21 @@ class Commissioning(Protocol):
 
     def set_baudrate(self, node: int, baudrate: int, *, save: bool = False) -> Plan[Change]:
         """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected."""
+
+    @property
+    def commands(self) -> Mapping[str, str]:
+        """What else a node can be told, and what that does to it."""
+
+    def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
+        """One of `commands`, said once and never repeated; returns what a person should know. Raises UnknownName, LimitError at
+        once; then NotSupported, DeviceError."""
+
+
+def known_command(commands: Mapping[str, str], name: str) -> str:
+    """What it does. Raises UnknownName."""
+    if name not in commands:
+        raise UnknownName(f"no command {name!r}: there are {', '.join(f'{each} ({what})' for each, what in commands.items())}")
+    return commands[name]
 
 
 class Driver(Protocol):

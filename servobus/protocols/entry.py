@@ -13,6 +13,11 @@ from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 
 
+def one_servo(node: int, model: str) -> dict[str, dict[str, Any]]:
+    """A node that is one servo."""
+    return {f"servo_{node}": {"id": node, "model": model}}
+
+
 @dataclass(frozen=True, slots=True)
 class ProtocolEntry:
     """The parts of one protocol. `options` below is always an instance of its own options class."""
@@ -35,3 +40,5 @@ class ProtocolEntry:
     baudrates: tuple[int, ...]
     """Rates a scan tries, the likely ones first."""
     scan_ids: range
+    starter: Callable[[int, str], Mapping[str, Mapping[str, Any]]] = one_servo
+    """(id, model) of what a scan found -> its servos, by name, as the YAML of a config."""

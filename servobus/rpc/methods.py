@@ -145,6 +145,13 @@ class SetBaudrate(Params):
     save: bool = False
 
 
+class Command(Params):
+    bus: str
+    node: int
+    name: str
+    value: int | None = None
+
+
 class Subscribe(Params):
     """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`."""
 
@@ -219,6 +226,7 @@ METHODS: dict[str, Method] = {
     "scan": Method(Scan, list[Found], Role.OPERATOR),
     "set_id": Method(SetId, Change, Role.ADMIN),
     "set_baudrate": Method(SetBaudrate, Change, Role.ADMIN),
+    "command": Method(Command, tuple[str, ...], Role.ADMIN),
     "reload": Method(Nothing, Reload, Role.ADMIN),
 }
 

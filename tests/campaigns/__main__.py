@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import faults, kst, line, turns
+from tests.campaigns import faults, kst, line, slow, turns
 from tests.campaigns.oracle import ORACLES
 
 
@@ -20,7 +20,7 @@ def soak_faults(count: int) -> bool:
         result.report(f"{protocol}: 1 % mixed faults, replies delivered whole")
         residual = faults.faults(count // 10, protocol=protocol, chop="bytes")
         residual.report(f"{protocol}: the same, delivered byte by byte (the residual of an 8-bit sum)")
-        kept &= not (result.wrong or result.leaked or result.waiting)
+        kept &= not (result.wrong or result.hung or result.leaked or result.waiting)
     return kept
 
 
@@ -29,8 +29,14 @@ def soak_cancel(count: int) -> bool:
     for protocol in ORACLES:
         result = faults.cancel(count // 10, protocol=protocol)
         result.report(f"{protocol}: cancelled callers")
-        kept &= not (result.wrong or result.leaked or result.waiting)
+        kept &= not (result.wrong or result.hung or result.leaked or result.waiting)
     return kept
+
+
+def soak_hand(_: int) -> bool:
+    result = slow.slow_hand(10_000)
+    result.report("roh: a hand slower than the deadline, 10 000 reads of changing registers")
+    return not (result.wrong or result.hung or result.leaked or result.waiting)
 
 
 def soak_line(_: int) -> bool:
@@ -54,7 +60,7 @@ def bench_kst(_: int) -> bool:
 
 
 CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
-    "soak": {"faults": soak_faults, "cancel": soak_cancel, "line": soak_line},
+    "soak": {"faults": soak_faults, "cancel": soak_cancel, "hand": soak_hand, "line": soak_line},
     "bench": {"turns": bench_turns, "kst": bench_kst},
 }
 

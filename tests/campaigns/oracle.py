@@ -22,6 +22,8 @@ from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.kst.codec import Command, KstCodec
 from servobus.protocols.kst.codec import encode as kst_encode
+from servobus.protocols.modbus.codec import Function, ModbusCodec, pack, words
+from servobus.protocols.modbus.codec import encode as modbus_encode
 from servobus.protocols.options import FaultOptions
 from servobus.protocols.sms.codec import Instruction, SmsCodec
 from servobus.protocols.sms.codec import encode as sms_encode
@@ -166,7 +168,40 @@ class KstOracle(Oracle):
         return kst_encode(frame[2] % SERVOS + 1, frame[3], frame[4:12])
 
 
-ORACLES: dict[str, type[Oracle]] = {"sms": SmsOracle, "kst": KstOracle}
+class RohOracle(Oracle):
+    """The number is the last word read. What tells the map stands where it has to."""
+
+    head = "    protocol: roh\n    baudrate: 115200\n"
+    servo = ", channel: index"
+    FIRST = (0x0200, 0x0301, 5, 0x2001, 1, 0, 2, 0, 1)
+    SPANS = ("1145:1", "1155:1", "1145:2", "1185:6", "1105:6", "1145:12")
+
+    def answer(self, frame: bytes) -> bytes | None:
+        codec = ModbusCodec("device")
+        codec.receive_data(frame)
+        heard = codec.next_reply()
+        if heard is None or not 1 <= heard.unit <= SERVOS or heard.function != Function.READ_HOLDING:
+            return None
+        address, count = words(heard.body)
+        told = list(self.FIRST[:count]) if address == 1000 else self._words(self._ask(heard.unit, (address, count)), count)
+        return modbus_encode(heard.unit, heard.function, bytes((2 * count,)) + pack(told))
+
+    def register(self, rng: random.Random) -> str:
+        return rng.choice(self.SPANS)
+
+    def right(self, value: Sequence[int], node: int, register: str, asked: float) -> bool:
+        address, count = map(int, register.split(":"))
+        return self._asked(value[-1], node, (address, count), asked) and list(value) == self._words(value[-1], count)
+
+    def rename(self, frame: bytes, rng: random.Random) -> bytes:
+        return modbus_encode(frame[0] % SERVOS + 1, frame[1], frame[2:-2])
+
+    @staticmethod
+    def _words(number: int, count: int) -> list[int]:
+        return [(number * at) & 0xFFFF for at in range(2, count + 1)] + [number]
+
+
+ORACLES: dict[str, type[Oracle]] = {"sms": SmsOracle, "kst": KstOracle, "roh": RohOracle}
 
 
 def service(protocol: str, faults: FaultOptions) -> tuple[BusService, Link, Oracle]:

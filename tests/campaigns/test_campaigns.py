@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from tests.campaigns import faults, line
+from tests.campaigns import faults, line, slow
 from tests.campaigns.faults import KINDS, Result
 from tests.campaigns.oracle import ORACLES
 
@@ -15,7 +15,7 @@ def assert_right(result: Result) -> None:
     assert (result.wrong, result.hung, result.leaked, result.waiting) == (0, 0, 0, 0)
 
 
-@pytest.mark.parametrize(("protocol", "seed"), [("sms", 1), ("sms", 2), ("kst", 1), ("kst", 2)])
+@pytest.mark.parametrize(("protocol", "seed"), [("sms", 1), ("sms", 2), ("kst", 1), ("kst", 2), ("roh", 1), ("roh", 2)])
 def test_faults(protocol: str, seed: int) -> None:
     result = faults.faults(20_000, protocol=protocol, seed=seed)
     assert_right(result)
@@ -54,3 +54,10 @@ def test_a_dead_servo_and_a_pulled_plug() -> None:
     assert figures.rate_with_dead > 0
     assert figures.unplug_errors == line.SERVOS - 1
     assert figures.replug > 0
+
+
+def test_a_hand_slower_than_the_deadline() -> None:
+    result = slow.slow_hand(1000)
+    assert_right(result)
+    assert result.reads > 200
+    assert result.timeouts > 50

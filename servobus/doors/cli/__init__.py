@@ -35,6 +35,7 @@ COMMANDS = {
     "clear": "motion",
     "set-id": "commission",
     "set-baud": "commission",
+    "command": "commission",
     "install-service": "install",
 }
 """Command -> the module beside this one that has it."""

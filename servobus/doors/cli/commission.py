@@ -1,4 +1,4 @@
-"""Commands that give servos their ids and rates: set-id, set-baud."""
+"""Commands that give servos their ids and rates, or tell them what is told once: set-id, set-baud, command."""
 
 from __future__ import annotations
 
@@ -44,20 +44,45 @@ def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: boo
     return _change(options, bus, lambda rig: rig.set_baudrate(bus, servo_id, baudrate, save=save))
 
 
-def _change(options: Options, bus: str, verb: Callable[[LocalRig], Awaitable[Change]]) -> int:
+@click.command()
+@click.argument("bus")
+@click.argument("servo_id", metavar="ID", type=Id)
+@click.argument("name")
+@click.argument("value", required=False, type=int)
+@servo_options
+def command(options: Options, bus: str, servo_id: int, name: str, value: int | None) -> int:
+    """Tell the servo or hand with this id on a bus of the config what is told once: restart, save, zero_force, ...
+
+    Which commands there are depends on the protocol: a name that is none lists them. Never repeated, even if nobody answers.
+    Nothing on the bus may be enabled.
+
+    Example: servobus command hand 2 zero_force
+    """
+
+    async def verb(rig: LocalRig) -> tuple[str, ...]:
+        return await rig.command(bus, servo_id, name, value)
+
+    return _change(options, bus, verb)
+
+
+def _change(options: Options, bus: str, verb: Callable[[LocalRig], Awaitable[Change | tuple[str, ...]]]) -> int:
     logs()
 
     async def main() -> int:
         if bus not in options.setup.buses:
             raise UnknownName(f"no bus {bus!r}: there are {', '.join(options.setup.buses)}")
         async with opened(options, only=[bus]) as rig:
-            change = await verb(rig)
+            done = await verb(rig)
             if options.as_json:
-                emit(change)
+                emit(done)
             else:
-                click.echo(str(change) if change.pending_reboot else f"{change.what} {change.value} is in effect")
-                for note in change.notes:
-                    click.echo(note)
+                click.echo("\n".join(_words(done)))
             return 0
 
     return run(main)
+
+
+def _words(done: Change | tuple[str, ...]) -> tuple[str, ...]:
+    if isinstance(done, Change):
+        return (str(done) if done.pending_reboot else f"{done.what} {done.value} is in effect", *done.notes)
+    return done or ("done",)

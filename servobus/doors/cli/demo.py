@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,26 +23,37 @@ from servobus.rig import Servo
 
 GOAL_HZ = 100.0
 FEEDBACK_HZ = 50.0
-SWING = 30.0
-"""Degrees to either side."""
+FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
 PERIOD = 4.0
 """Seconds of one swing."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A bus of the demo; its servos swing about `middle`, in their unit."""
+
+    protocol: str
+    baudrate: int
+    servos: Sequence[str]
+    middle: float = 0.0
+    swing: float = 30.0
+
+
 LINES = {
-    "arm": ("sms", 1_000_000, "sts", 6),
-    "base": ("sms", 115_200, "sms", 4),
-    "gimbal": ("kst", 512_000, "kst", 4),
+    "arm": Line("sms", 1_000_000, [f"sts{number}: {{id: {number}, model: sts, max_speed: 300}}" for number in range(1, 7)]),
+    "base": Line("sms", 115_200, [f"sms{number}: {{id: {number}, model: sms, max_speed: 300}}" for number in range(1, 5)]),
+    "gimbal": Line("kst", 512_000, [f"kst{number}: {{id: {number}, max_speed: 300}}" for number in range(1, 5)]),
+    "hand": Line("roh", 115_200, [f"{channel}: {{id: 2, channel: {channel}}}" for channel in FINGERS], middle=50, swing=40),
 }
-"""Bus -> protocol, baud rate, model and number of its servos."""
 
 
 def config_text() -> str:
     """The simulated rig."""
     text = "version: 1\nbuses:\n"
-    for bus, (protocol, baudrate, model, count) in LINES.items():
-        text += f"  {bus}:\n    protocol: {protocol}\n    port: 'sim:'\n    baudrate: {baudrate}\n"
+    for bus, line in LINES.items():
+        text += f"  {bus}:\n    protocol: {line.protocol}\n    port: 'sim:'\n    baudrate: {line.baudrate}\n"
         text += f"    poll: {{feedback: {FEEDBACK_HZ:g}}}\n    goal_rate: {GOAL_HZ:g}\n    servos:\n"
-        for number in range(1, count + 1):
-            text += f"      {model}{number}: {{id: {number}, model: {model}, max_speed: 300}}\n"
+        text += "".join(f"      {servo}\n" for servo in line.servos)
     return text
 
 
@@ -57,10 +69,10 @@ class Tally:
 @click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="How long to stream.")
 @click.option("--json", "as_json", is_flag=True, help="For machines.")
 def demo(seconds: float, as_json: bool) -> int:
-    """Stream goals to 14 simulated servos on three lines with real wire time, and print what the lines carried.
+    """Stream goals to 20 simulated servos on four lines with real wire time, and print what the lines carried.
 
-    Six STS at 1 Mbaud, four SMS at 115200 baud and four KST at 512000; one caller per servo sends 100 goals a second,
-    feedback is polled at 50 Hz.
+    Six STS at 1 Mbaud, four SMS at 115200 baud, four KST at 512000 and the six fingers of a ROH hand at 115200; one caller per
+    servo sends 100 goals a second, feedback is polled at 50 Hz.
 
     Example: servobus demo --seconds 3
     """
@@ -99,11 +111,11 @@ def demo(seconds: float, as_json: bool) -> int:
 
 async def _caller(servo: Servo, tally: Tally, started: float, seconds: float) -> None:
     """Goals on a fixed grid. A goal that is not through when the next is due is replaced by it, as in any streaming caller."""
-    loop = asyncio.get_running_loop()
+    loop, line = asyncio.get_running_loop(), LINES[servo.name.partition("/")[0]]
     pending: set[asyncio.Task[None]] = set()
     for tick in range(int(seconds * GOAL_HZ)):
         await asyncio.sleep(started + tick / GOAL_HZ - loop.time())
-        position = SWING * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD)
+        position = line.middle + line.swing * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD)
         task = loop.create_task(_send(servo, position, tally))
         pending.add(task)
         task.add_done_callback(pending.discard)

@@ -23,7 +23,7 @@ def install_service(config: str, writing: bool, root: Path, force: bool) -> None
     CONFIG is where the service will find it, /etc/servobus/servobus.yaml if omitted; when it exists it is checked, and the unit
     opens the network only if the config needs it. Nothing is started.
 
-    Example: sudo servobus install-service --write
+    Example: servobus install-service /etc/servobus/servobus.yaml --write
     """
     path = Path(config).absolute()
     network = False

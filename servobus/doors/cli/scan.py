@@ -174,7 +174,9 @@ def starter(config: Config, name: str, found: list[Found]) -> str:
     options = config.buses[name]
     rate = max((hit.baudrate for hit in found), key=lambda rate: sum(hit.baudrate == rate for hit in found))
     usable = [hit for hit in found if hit.baudrate == rate and hit.model]
-    servos = CommentedMap((f"servo_{hit.id}", CommentedMap(id=hit.id, model=hit.model)) for hit in usable)
+    write = PROTOCOLS[options.protocol].starter
+    entries = (entry for hit in usable for entry in write(hit.id, hit.model or "").items())
+    servos = CommentedMap((servo, CommentedMap(keys)) for servo, keys in entries)
     for servo in servos.values():
         servo.fa.set_flow_style()
     bus = CommentedMap(protocol=options.protocol, port=options.port, baudrate=rate, poll=CommentedMap(feedback=20), servos=servos)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols.base import Plan, ask
+from servobus.protocols.base import Plan, ask, known_command
 from servobus.protocols.kst.codec import SAVE_WORD, Command
 from servobus.protocols.kst.identity import look
 from servobus.protocols.kst.options import KstBus
@@ -23,6 +24,8 @@ DOUBTFUL_ID = 0xFF
 
 class Commissioning:
     """Remembers which nodes wait for a restart."""
+
+    commands: ClassVar = {"save": "writes its settings to flash"}
 
     def __init__(self, options: KstBus, wire: Wire) -> None:
         self.options = options
@@ -49,6 +52,12 @@ class Commissioning:
             raise LimitError(f"baud rate {baudrate} is none of {known}: nothing was sent")
         self._refuse_second(node)
         return self._change(Change(node, "baudrate", baudrate), Command.SET_BAUD, codes[0], save)
+
+    def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
+        known_command(self.commands, name)
+        if value is not None:
+            raise LimitError(f"{name} takes no value: nothing was sent")
+        return self.save(node)
 
     def save(self, node: int) -> Plan[tuple[str, ...]]:
         """Write the servo's settings to its flash, once. Returns what a person should know of it."""

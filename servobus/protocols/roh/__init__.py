@@ -1,10 +1,13 @@
 """OHand ROH hands: holding registers by Modbus-RTU (the seed), on a line of their own or behind a RealMan arm."""
 
+from typing import Any
+
 from servobus.protocols.entry import ProtocolEntry
 from servobus.protocols.modbus.codec import MAX_UNIT, ModbusCodec, node_of, rename
 from servobus.protocols.roh.device import devices
 from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.load import load_models
+from servobus.protocols.roh.model import CHANNELS
 from servobus.protocols.roh.options import RohBus
 
 
@@ -15,6 +18,11 @@ def codec(options: RohBus | None) -> ModbusCodec:
 
 def device_codec(options: RohBus | None) -> ModbusCodec:
     return ModbusCodec("device")
+
+
+def fingers(unit: int, model: str) -> dict[str, dict[str, Any]]:
+    """A hand is six servos; which map it has is found out again."""
+    return {f"{channel}_{unit}": {"id": unit, "channel": channel} for channel in CHANNELS}
 
 
 ENTRY = ProtocolEntry(
@@ -29,4 +37,5 @@ ENTRY = ProtocolEntry(
     # All hands ship with the first; those of the second generation find the line's rate by themselves, within these.
     baudrates=(115_200, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600),
     scan_ids=range(1, MAX_UNIT + 1),
+    starter=fingers,
 )

@@ -7,6 +7,7 @@ answer, and a restart.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from servobus.protocols.base import DeviceReply
@@ -30,6 +31,7 @@ class RohDevice(HandBody):
         self.delay = DELAY
         self.extra_delay = 0.0
         """Seconds that its answers come too late."""
+        self._due = -math.inf
         self.dead = False
         """Hears and says nothing."""
         self.obeys_broadcasts = True
@@ -56,7 +58,9 @@ class RohDevice(HandBody):
         restarted = self._awake != awake or self.state == "update"
         if (everybody and not self.answers_broadcasts) or (restarted and not self.answers_restart):
             return ()
-        return (DeviceReply(answer, self.delay, late=self.extra_delay),)
+        # One after the other: a late answer is not overtaken by the next.
+        self._due = max(self._due, now + self.extra_delay)
+        return (DeviceReply(answer, self.delay, late=self._due - now),)
 
     # Questions
 

@@ -47,7 +47,7 @@ class RohDriver:
         self.nodes = {name: finger.node for name, finger in self.fingers.items()}
         self._models = models
         self.hands = {unit: self._hand(unit) for unit in dict.fromkeys(self.nodes.values())}
-        self.unit_plans = Commissioning(self._hand_of)
+        self.commissioning = Commissioning(self._hand_of)
         # Requests are immutable, and the same few are said again and again.
         self._reads: dict[tuple[Hashable, ...], Request[Any]] = {}
 
@@ -63,10 +63,6 @@ class RohDriver:
     def _of(self, servo: str) -> tuple[Finger, Hand]:
         finger = self.fingers[servo]
         return finger, self.hands[finger.node]
-
-    @property
-    def commissioning(self) -> None:
-        """A hand's unit id belongs to all its fingers: see `unit_plans`."""
 
     def carries(self, traits: LineTraits) -> None:
         self.limits.read, self.limits.write = self.options.limits(traits)

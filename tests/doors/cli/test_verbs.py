@@ -284,7 +284,7 @@ def test_a_dry_run_opens_no_port(call: Call, rig: Path) -> None:
 
 def test_demo(call: Call) -> None:
     found = call.json("demo", "--seconds", "0.5")
-    assert {name: row["errors"] for name, row in found.items()} == {"arm": 0, "base": 0, "gimbal": 0}
+    assert {name: row["errors"] for name, row in found.items()} == {"arm": 0, "base": 0, "gimbal": 0, "hand": 0}
     assert found["arm"]["goals accepted"] == 300
     assert call("demo", "--seconds", "0.5") == 0
     assert "of the line; it carries that" in call.out

@@ -123,7 +123,7 @@ def test_registers_are_written_once_and_read_back() -> None:
 def test_registers_of_other_verbs_are_not_written_by_name() -> None:
     bench = Bench().enable()
     refused = {
-        "node_id": r"commissioning \(set_unit\)",
+        "node_id": r"commissioning \(set_id\)",
         "recalibrate": "commissioning",
         "reset": "commissioning",
         "start_init": "commissioning",
