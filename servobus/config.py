@@ -18,7 +18,7 @@ from servobus import yamlfile
 from servobus.access import AccessOptions, DoorOptions
 from servobus.complaints import Complaints, show, sound_part
 from servobus.errors import ConfigError, ServobusError
-from servobus.links import check_port
+from servobus.links import TUNNELS, check_port
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions, Name, ServoOptions
 from servobus.protocols.table import PROTOCOLS
@@ -215,6 +215,13 @@ def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complain
             complaints.add((*here, key), f"found {value:g}; {told}")
 
 
+def _check_tunnel(options: BusOptions) -> None:
+    scheme = options.port.partition(":")[0]
+    passes = TUNNELS.get(scheme, options.protocol)
+    if passes != options.protocol:
+        raise ConfigError(f"{scheme}:// passes {passes} on and nothing else; {options.protocol} needs a line of its own")
+
+
 def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> None:
     """Each line has one owner, by whatever name it goes."""
     owners: dict[str, str] = {}
@@ -225,6 +232,7 @@ def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> Non
                 has_wire_time(options.port)
                 continue
             check_port(options.port)
+            _check_tunnel(options)
         except ServobusError as error:
             complaints.add(path, error.message.replace(repr(options.port), show(options.port)))
             continue

@@ -80,6 +80,7 @@ class Keeper:
             await anyio.sleep(RETRY)
             return
         self.down = None
+        self.bus.line.traits = self.link.traits  # what is known of it only now: a tunnel's limits
         self._event("line_up", bus=self.name, port=self.link.address)
         await self.bus.start()
         self.tried.set()

@@ -64,6 +64,7 @@ def _seconds(requests: Sequence[Request[Any]], traits: LineTraits) -> float:
     """The time these hold the line."""
     return sum(
         traits.gap
+        + traits.turn
         + (len(request.frame) + request.replies * request.reply_size) * traits.byte_time
         + request.replies * TURNAROUND
         + request.quiet_after

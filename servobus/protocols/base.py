@@ -28,6 +28,8 @@ class LineTraits:
     """Bytes really take their wire time, so whatever is heard before the request can have left is no answer to it."""
     latency: float = 0.0
     """What adapter, driver or tunnel add to every reply."""
+    turn: float = 0.0
+    """What a tunnel takes for each turn, beside the bytes of the line behind it."""
     gap: float = 0.0
     """Silence before each frame."""
     can_change_baud: bool = False

@@ -1,19 +1,21 @@
-"""Simulated buses for other programs: one PTY a bus, until cancelled. What `servobus sim` runs.
+"""Simulated buses for other programs: one PTY a bus, or one arm on a TCP port, until cancelled. What `servobus sim` runs.
 
-The `port` of a bus plays no part. Bytes take their time at the rate that the PTY's user set, and a servo hears only its own.
+The `port` of a bus plays no part, but for saying whether its hands are behind a RealMan arm. Bytes take their time at the rate
+that the PTY's user set, and a servo hears only its own.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing
+from contextlib import AsyncExitStack, closing
 from pathlib import Path
 
 import anyio
 
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
+from servobus.sim.arm import address, arm_server, is_arm
 from servobus.sim.build import far_end, simulated_line
 from servobus.sim.pty import SimPty
 
@@ -28,9 +30,13 @@ async def serve(
     """`announce` is told name and path of each bus, once all can be opened. `models`: those of each bus, by bus name. `folder`:
     where each path is a link with the name of its bus; its files are left alone. Raises FileExistsError, OSError."""
     loop = asyncio.get_running_loop()
-    with ExitStack() as stack:
+    async with AsyncExitStack() as stack:
         paths = {}
         for name, options in buses.items():
+            if is_arm(options.port):
+                server = await stack.enter_async_context(arm_server(options, models[name]))
+                paths[name] = address(options, server)
+                continue
             line = stack.enter_context(closing(simulated_line(options, models[name], loop)))
             symlink = folder / name if folder else None
             far = far_end(options, line, loop)

@@ -58,7 +58,7 @@ def test_bad_addresses(port: str) -> None:
 @pytest.mark.parametrize("port", ["socket://server:23", "udp://server:23", "://", "http://server"])
 def test_unknown_schemes(port: str) -> None:
     """All known forms are listed."""
-    with pytest.raises(ConfigError, match=r"is not known; write a device path, tcp://HOST:PORT or sim:$"):
+    with pytest.raises(ConfigError, match=r"is not known; write a device path, tcp://HOST:PORT, realman://HOST:PORT.* or sim:$"):
         open_link(port, 9_600)
 
 

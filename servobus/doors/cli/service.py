@@ -72,7 +72,8 @@ def sim(config: str, folder: Path | None) -> None:
     """Serve the servos of CONFIG, simulated, as serial ports that any program can open.
 
     Prints one line `BUS PATH` for each bus on standard output and nothing else there, then serves until it is interrupted. The
-    config's `port` plays no part; a servo hears only its own baud rate.
+    config's `port` plays no part, but that realman://... becomes a simulated arm on a TCP port (`BUS realman://127.0.0.1:...`).
+    A servo hears only its own baud rate.
 
     Example: servobus sim config/sim.yaml
     """

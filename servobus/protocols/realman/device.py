@@ -1,0 +1,184 @@
+"""A simulated RealMan arm from the other end of the JSON lines, with whatever answers Modbus-RTU behind its ports. Sans-IO.
+
+Where the documents are silent it does this: an unknown command is not answered; a Modbus command before the mode was set, or one
+beyond the arm's register limits, fails like any other, with one bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from servobus.protocols.modbus.codec import REFUSED, Function, ModbusCodec, encode, pack, words
+from servobus.protocols.realman.codec import TOOL, WHO, WHO_2, WHO_2_ANSWER, WHO_ANSWER, Message
+
+Exchange = Callable[[bytes], bytes | None]
+"""A Modbus-RTU question -> its answer; None: nobody answers."""
+JOINTS = 6
+VERSION = {"build_time": "2024/01/01 00:00:00", "commit_id": "0000000", "version": "V1.0.0"}
+
+
+class SimArm:
+    """One arm of generation 2, 3 or 4."""
+
+    def __init__(self, exchange: Exchange, generation: int = 3) -> None:
+        self.generation = generation
+        self.modes: dict[int, int] = {}
+        """Port -> baud rate, where it is a Modbus master."""
+        self.voltage = 0
+        self.refuses_modes = False
+        self._exchange = exchange
+        self._verbs: Mapping[str, Callable[[Message], Message | None]] = VERBS_4 if generation >= 4 else VERBS_3
+
+    def handle(self, message: Message) -> Message | None:
+        """The reply, if it is one that the arm answers."""
+        command = message.get("command")
+        if not isinstance(command, str):
+            return None
+        if command in self._verbs:
+            try:
+                return self._verbs[command](self, message)  # type: ignore[call-arg, arg-type]
+            except (KeyError, TypeError, ValueError):
+                return {"command": command, _state(command): False}
+        return self._self_portrait(command)
+
+    def _self_portrait(self, command: str) -> Message | None:
+        if command == WHO_2["command"]:
+            return {"state": WHO_2_ANSWER, "Product_version": "RM65", "Plan_version": "v1.0.0"}
+        if self.generation == 2 and command == WHO["command"]:
+            return None
+        if command == WHO["command"]:
+            newest = {"robot_controller_version": "4.0"} if self.generation >= 4 else {}
+            return {
+                "command": WHO_ANSWER,
+                "Product_version": "RM65-BI",
+                "algorithm_info": {"version": "1.0.0"},
+                "ctrl_info": VERSION,
+                "dynamic_info": {"model_version": "1"},
+                "plan_info": VERSION,
+                **newest,
+            }
+        return PORTRAIT.get(command)
+
+    # Modes
+
+    def set_voltage(self, message: Message) -> Message:
+        self.voltage = int(message["voltage_type"])
+        return {"command": message["command"], "state": True}
+
+    def set_mode(self, message: Message) -> Message:
+        if not self.refuses_modes:
+            self.modes[int(message.get("port", TOOL))] = int(message["baudrate"])
+        return {"command": message["command"], "set_state": not self.refuses_modes}
+
+    def set_controller_mode(self, message: Message) -> Message:
+        return self.set_mode({**message, "port": 0})
+
+    def close_mode(self, message: Message) -> Message:
+        self.modes.pop(int(message["port"]), None)
+        return {"command": message["command"], "set_state": True}
+
+    # Registers, generations 2 and 3
+
+    def read_one(self, message: Message) -> Message:
+        found = self._read(message, int(message["port"]), 1)
+        return self._told(message, "read_state", None if found is None else found[0])
+
+    def read_some(self, message: Message) -> Message:
+        count = int(message["num"])
+        found = self._read(message, int(message["port"]), count) if count <= 12 else None
+        return self._told(message, "read_state", None if found is None else list(pack(found)))
+
+    def write_one(self, message: Message) -> Message:
+        return self._write(message, int(message["port"]), [int(message["data"])])
+
+    def write_some(self, message: Message) -> Message:
+        count = int(message["num"])
+        values = words(bytes(message["data"]))
+        if count > 10 or len(values) != count:
+            raise ValueError
+        return self._write(message, int(message["port"]), values)
+
+    # Registers, generation 4
+
+    def read_words(self, message: Message) -> Message:
+        count = int(message["num"])
+        return self._told(message, "read_state", self._read(message, int(message["type"]), count) if count <= 100 else None)
+
+    def write_words(self, message: Message) -> Message:
+        return self._write(message, int(message["type"]), [int(value) for value in message["data"]])
+
+    # The wire behind it
+
+    def _read(self, message: Message, port: int, count: int) -> list[int] | None:
+        body = self._ask(message, port, Function.READ_HOLDING, pack((int(message["address"]), count)))
+        return None if body is None else words(body[1:])
+
+    def _write(self, message: Message, port: int, values: list[int]) -> Message:
+        told = pack((int(message["address"]), len(values)))
+        body = self._ask(message, port, Function.WRITE_MULTIPLE, told + bytes((2 * len(values),)) + pack(values))
+        return {"command": message["command"], "write_state": body is not None}
+
+    def _ask(self, message: Message, port: int, function: int, body: bytes) -> bytes | None:
+        """What follows the function of the answer; None: no answer, an exception, or no Modbus on that port."""
+        if port not in self.modes:
+            return None
+        answer = self._exchange(encode(int(message["device"]), function, body))
+        codec = ModbusCodec("master")
+        codec.receive_data(answer or b"")
+        reply = codec.next_reply()
+        return None if reply is None or reply.function & REFUSED else reply.body
+
+    @staticmethod
+    def _told(message: Message, state: str, data: Any) -> Message:
+        return {"command": message["command"], **({state: False} if data is None else {"data": data})}
+
+
+def _state(command: str) -> str:
+    return "write_state" if command.startswith("write") else "read_state" if command.startswith("read") else "set_state"
+
+
+_six: list[int] = [0] * JOINTS
+PORTRAIT: dict[str, Message] = {
+    "get_realtime_push": {
+        "command": "get_realtime_push",
+        "cycle": 5,
+        "enable": False,
+        "ip": "127.0.0.1",
+        "port": 8089,
+        "custom": {"expand_state": False, "joint_speed": False, "lift_state": False},
+    },
+    "get_arm_current_trajectory": {"state": "arm_current_trajectory", "type": "none", "data": _six},
+    "get_current_work_frame": {"state": "current_work_frame", "frame_name": "World", "pose": _six},
+    "get_current_tool_frame": {
+        "state": "current_tool_frame",
+        "tool_name": "Arm_Tip",
+        "pose": _six,
+        "payload": 0,
+        "position": [0, 0, 0],
+    },
+    "get_install_pose": {"state": "install_pose", "pose": [0, 0, 0]},
+    "get_joint_min_pos": {"state": "joint_min_pos", "min_pos": [-178_000] * JOINTS},
+    "get_joint_max_pos": {"state": "joint_max_pos", "max_pos": [178_000] * JOINTS},
+    "get_joint_max_acc": {"state": "joint_max_acc", "joint_acc": [600_000] * JOINTS},
+    "get_joint_max_speed": {"state": "joint_max_speed", "joint_speed": [180_000] * JOINTS},
+    "get_DH_data": {"command": "get_DH_data", **{f"joint_{number}": [0, 0, 0, 0] for number in range(1, JOINTS + 1)}},
+}
+"""What a client asks an arm before it believes that it is one."""
+
+VERBS_3: dict[str, Callable[..., Message]] = {
+    "set_tool_voltage": SimArm.set_voltage,
+    "set_modbus_mode": SimArm.set_mode,
+    "close_modbus_mode": SimArm.close_mode,
+    "read_holding_registers": SimArm.read_one,
+    "read_multiple_holding_registers": SimArm.read_some,
+    "write_single_register": SimArm.write_one,
+    "write_registers": SimArm.write_some,
+}
+VERBS_4: dict[str, Callable[..., Message]] = {
+    "set_tool_voltage": SimArm.set_voltage,
+    "set_tool_rs485_mode": SimArm.set_mode,
+    "set_controller_rs485_mode": SimArm.set_controller_mode,
+    "read_modbus_rtu_holding_registers": SimArm.read_words,
+    "write_modbus_rtu_registers": SimArm.write_words,
+}
