@@ -6,10 +6,12 @@ from collections.abc import Awaitable, Callable
 
 import click
 
-from servobus.doors.cli.common import Options, emit, logs, opened, run, servo_options
+from servobus.config import Config
+from servobus.doors.cli.common import emit, logs, run
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.errors import UnknownName
-from servobus.local import LocalRig
 from servobus.protocols.words import Change
+from servobus.rig import Rig
 
 Id = click.IntRange(0, 255)
 
@@ -44,13 +46,15 @@ def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: boo
     return _change(options, bus, lambda rig: rig.set_baudrate(bus, servo_id, baudrate, save=save))
 
 
-def _change(options: Options, bus: str, verb: Callable[[LocalRig], Awaitable[Change]]) -> int:
+def _change(options: Options, bus: str, verb: Callable[[Rig], Awaitable[Change]]) -> int:
     logs()
 
+    def refuse(config: Config) -> None:
+        if bus not in config.buses:
+            raise UnknownName(f"no bus {bus!r}: there are {', '.join(config.buses)}")
+
     async def main() -> int:
-        if bus not in options.setup.buses:
-            raise UnknownName(f"no bus {bus!r}: there are {', '.join(options.setup.buses)}")
-        async with opened(options, only=[bus]) as rig:
+        async with opened(options, only=[bus], before=refuse) as rig:
             change = await verb(rig)
             if options.as_json:
                 emit(change)
