@@ -1,5 +1,6 @@
 """servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos."""
 
+from servobus.client import RemoteRig, connect
 from servobus.errors import (
     AccessDenied,
     ActionWithheld,
@@ -52,6 +53,7 @@ __all__ = [
     "PortDenied",
     "PortMissing",
     "Reload",
+    "RemoteRig",
     "ReplyTimeout",
     "Rig",
     "Servo",
@@ -60,5 +62,6 @@ __all__ = [
     "State",
     "StopReport",
     "UnknownName",
+    "connect",
     "open",
 ]

@@ -217,6 +217,11 @@ class LocalRig(Rig):
         bus, servo = self.bus_of(name)
         return await bus.read(servo, max_age)
 
+    def state(self, name: str) -> State:
+        """What is known of one, without a turn."""
+        bus, servo = self.bus_of(name)
+        return bus.state(servo)
+
     def known(self, name: str, max_age: float) -> State | None:
         """What `read` would answer without a turn; None: it would need one."""
         bus, servo = self.bus_of(name)

@@ -6,10 +6,12 @@ from collections.abc import Awaitable, Callable
 
 import click
 
-from servobus.doors.cli.common import Options, emit, logs, opened, run, servo_options
+from servobus.config import Config
+from servobus.doors.cli.common import emit, logs, run
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.errors import UnknownName
-from servobus.local import LocalRig
 from servobus.protocols.words import Change
+from servobus.rig import Rig
 
 Id = click.IntRange(0, 255)
 
@@ -59,19 +61,21 @@ def command(options: Options, bus: str, servo_id: int, name: str, value: int | N
     Example: servobus command hand 2 zero_force
     """
 
-    async def verb(rig: LocalRig) -> tuple[str, ...]:
+    async def verb(rig: Rig) -> tuple[str, ...]:
         return await rig.command(bus, servo_id, name, value)
 
     return _change(options, bus, verb)
 
 
-def _change(options: Options, bus: str, verb: Callable[[LocalRig], Awaitable[Change | tuple[str, ...]]]) -> int:
+def _change(options: Options, bus: str, verb: Callable[[Rig], Awaitable[Change | tuple[str, ...]]]) -> int:
     logs()
 
+    def refuse(config: Config) -> None:
+        if bus not in config.buses:
+            raise UnknownName(f"no bus {bus!r}: there are {', '.join(config.buses)}")
+
     async def main() -> int:
-        if bus not in options.setup.buses:
-            raise UnknownName(f"no bus {bus!r}: there are {', '.join(options.setup.buses)}")
-        async with opened(options, only=[bus]) as rig:
+        async with opened(options, only=[bus], before=refuse) as rig:
             done = await verb(rig)
             if options.as_json:
                 emit(done)

@@ -1,21 +1,17 @@
-"""What the commands share: where the config is, which buses to open, how to say things, and how to run."""
+"""What the commands share: how to say things, and how to run. How they come by a rig stands in `reach`."""
 
 from __future__ import annotations
 
 import asyncio
 import dataclasses
-import functools
 import json
 import logging
 import math
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, TextIO, TypeVar, cast
 
 import click
@@ -23,20 +19,10 @@ import structlog
 from rich.console import Console
 from rich.table import Table
 
-from servobus.config import Config, load_config
-from servobus.doors.cli.tracing import Tracer
 from servobus.doors.cli.voice import Voice
-from servobus.errors import ConfigError, DeviceError
-from servobus.keeper import Trace
-from servobus.local import LocalRig
-from servobus.opening import open_rig
-from servobus.protocols.table import PROTOCOLS
 from servobus.protocols.words import State
-from servobus.rig import full_name
 
 R = TypeVar("R")
-F = TypeVar("F", bound=Callable[..., Any])
-DEFAULT_CONFIG = "servobus.yaml"
 ENDINGS = (signal.SIGTERM, signal.SIGHUP)
 
 
@@ -50,87 +36,16 @@ class Number(click.FloatRange):
         return number
 
 
-@dataclass(frozen=True)
-class Options:
-    """What every command on servos takes."""
-
-    config: str | None
-    as_json: bool
-    trace: bool
-    dry_run: bool
-
-    @cached_property
-    def setup(self) -> Config:
-        """The config; on simulated servos when nothing shall be sent. Raises ConfigError."""
-        if self.config is None and not Path(DEFAULT_CONFIG).exists():
-            raise ConfigError(
-                f"no config: give -c CONFIG, set SERVOBUS_CONFIG, or make ./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)"
-            )
-        config = load_config(self.config or DEFAULT_CONFIG)
-        return simulated(config) if self.dry_run else config
-
-
-def servo_options(command: F) -> F:
-    """Adds the options and hands them over as one `options`."""
-
-    @click.option(
-        "-c", "--config", envvar="SERVOBUS_CONFIG", metavar="CONFIG", help="Bus config (YAML). Default: ./servobus.yaml."
-    )
-    @click.option("--json", "as_json", is_flag=True, help="For machines: one JSON document on standard output.")
-    @click.option("--trace", is_flag=True, help="Print every frame, both ways and decoded, on standard error.")
-    @click.option("--dry-run", is_flag=True, help="Open no port: run on simulated servos and print what would be sent.")
-    @functools.wraps(command)
-    def wrapper(config: str | None, as_json: bool, trace: bool, dry_run: bool, **arguments: Any) -> Any:
-        return command(options=Options(config, as_json, trace, dry_run), **arguments)
-
-    return wrapper  # type: ignore[return-value]
-
-
-def simulated(config: Config) -> Config:
-    """The same servos, but none of them real."""
-    buses = {name: options.model_copy(update={"port": "sim:", "faults": None}) for name, options in config.buses.items()}
-    return replace(config, buses=buses)
-
-
-@asynccontextmanager
-async def opened(
-    options: Options, names: Collection[str] = (), *, only: Collection[str] = (), degraded: bool = False
-) -> AsyncIterator[LocalRig]:
-    """A rig with the buses of these servos, or with `only` these, or with all; `degraded`: without those whose port cannot be
-    opened. Raises UnknownName before a port is opened, and DeviceError when a servo did not confirm how it was left."""
-    config = options.setup
-    full = [full_name(config.names, name) for name in names]
-    buses = dict.fromkeys([*only, *(config.names[name][0] for name in full)])
-    async with traced(config, options) as trace, open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
-        yield rig
-    doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]
-    if doubtful:
-        raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; look before you touch")
-
-
-@asynccontextmanager
-async def traced(config: Config, options: Options) -> AsyncIterator[Trace | None]:
-    """What prints frames in words, if that is wanted. A dry run prints what would be sent, on standard output unless that is
-    JSON."""
-    if options.dry_run:
-        click.echo("dry run: on simulated servos, no port is opened", err=True)
-    if not (options.trace or options.dry_run):
-        yield None
-        return
-    codecs = {name: PROTOCOLS[bus.protocol].codec(bus) for name, bus in config.buses.items()}
-    voice = Voice(sys.stderr if options.trace or options.as_json else sys.stdout)
-    tracer = Tracer(codecs, voice.say, heard=options.trace)
-    try:
-        yield tracer
-    finally:
-        tracer.close()
-
-
-def run(main: Callable[[], Coroutine[Any, Any, R]], *, terminated: int = 128 + signal.SIGTERM) -> R:
-    """Run it on the fastest loop there is. Ctrl-C, SIGTERM and a terminal that is closed end it in order, so that exit policies
-    are applied; the status is 130 after the first, `terminated` after the others."""
+def run(
+    main: Callable[[], Coroutine[Any, Any, R]],
+    *,
+    terminated: int = 128 + signal.SIGTERM,
+    endings: Sequence[signal.Signals] = ENDINGS,
+) -> R:
+    """Run it on the fastest loop there is. Ctrl-C, and the signals `endings` (SIGTERM, a terminal that is closed), end it in
+    order, so that exit policies are applied; the status is 130 after the first, `terminated` after the others."""
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
-        return runner.run(_until_terminated(main, terminated))
+        return runner.run(_until_terminated(main, terminated, endings))
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
@@ -142,7 +57,7 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
     return None
 
 
-async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: int) -> R:
+async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: int, endings: Sequence[signal.Signals]) -> R:
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
     assert task is not None
     received: list[int] = []
@@ -153,7 +68,7 @@ async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: 
         received.append(status)
         task.cancel()
 
-    for number in ENDINGS:
+    for number in endings:
         loop.add_signal_handler(number, terminate)
     try:
         return await main()
@@ -162,7 +77,7 @@ async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: 
             raise SystemExit(status) from None
         raise
     finally:
-        for number in ENDINGS:
+        for number in endings:
             loop.remove_signal_handler(number)
 
 

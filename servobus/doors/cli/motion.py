@@ -1,23 +1,30 @@
-"""Commands that move or stop: move, enable, disable, stop, clear. No daemon runs, so each opens the port itself and
-leaves it again: what it enabled is then left as the servo's `on_exit` says.
+"""Commands that move or stop: move, enable, disable, stop, clear. Through the daemon where one runs; else each opens the port
+itself and leaves it again, and what it enabled is then left as the servo's `on_exit` says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import click
 
 from servobus.bus.limits import check_goal
 from servobus.config import Config
-from servobus.doors.cli.common import Number, Options, echo_table, emit, logs, opened, run, servo_options
+from servobus.doors.cli.common import Number, echo_table, emit, logs, run
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.errors import LimitError, NotSupported, ServobusError
+from servobus.local import LocalRig
 from servobus.protocols.table import PROTOCOLS
 from servobus.protocols.words import Goal, ServoGoal
-from servobus.rig import full_name
+from servobus.rig import Rig, full_name
 
 NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
-THEN = {"hold": "holds (on_exit)", "limp": "goes limp (on_exit)", "park": "parks, then goes limp (on_exit)"}
+THEN = {
+    "stays": "stays enabled",
+    "hold": "holds (on_exit)",
+    "limp": "goes limp (on_exit)",
+    "park": "parks, then goes limp (on_exit)",
+}
 """What an exit policy leaves, in words."""
 
 
@@ -38,44 +45,61 @@ def move(
     confirm: bool,
     timeout: float,
 ) -> int:
-    """Enable servos, move them, wait until they stand, and leave them as their `on_exit` says.
+    """Move servos and wait until they stand. Through a daemon they must be enabled, and stay so.
 
-    Positions in each servo's unit (degrees if it names none). What a limit forbids is refused before a port is opened. Ctrl-C
-    stops the motion by the same `on_exit`.
+    Without a daemon they are enabled first, and left as their `on_exit` says at the end. Positions in each servo's unit (degrees
+    if it names none). What a limit forbids is refused before a port is opened. Ctrl-C stops the motion: by `on_lost_client`
+    through a daemon, else by `on_exit`.
 
     Example: servobus move shoulder=10 elbow=-20 --speed 30
     """
     logs()
-    goals = _goals(options.setup, targets, speed, duration)
+    said = _targets(targets)
+
+    def refuse(config: Config) -> None:
+        _refuse(config, _full(said, lambda name: full_name(config.names, name)), speed, duration)
 
     async def main() -> int:
-        async with opened(options, list(goals)) as rig:
-            await rig.enable(*goals)
+        async with opened(options, list(said), before=refuse) as rig:
+            goals = _full(said, rig.full_name)
+            if isinstance(rig, LocalRig):
+                await rig.enable(*goals)
             await rig.move(goals, together=together, confirm=confirm, speed=speed, duration=duration)
             states = await rig.settle(*goals, timeout=timeout)
             if options.as_json:
-                emit({name: {"position": state.position, "then": _on_exit(rig.config, name)} for name, state in states.items()})
+                emit({name: {"position": state.position, "then": _then(rig, name)} for name, state in states.items()})
             else:
-                echo_table(
-                    None,
-                    ("servo", "position", "then"),
-                    [(name, state.position, THEN[_on_exit(rig.config, name)]) for name, state in states.items()],
-                )
+                rows = [(name, state.position, _words(rig, name)) for name, state in states.items()]
+                echo_table(None, ("servo", "position", "then"), rows)
             return 0
 
     return run(main)
 
 
-def _goals(config: Config, targets: Iterable[str], speed: float | None, duration: float | None) -> dict[str, float]:
-    """Full name -> position. Refuses what no servo of that kind may do while nothing is energised yet: LimitError, UnknownName,
-    NotSupported."""
-    goals: dict[str, float] = {}
-    for text in targets:
-        said, position = _target(text)
-        name = full_name(config.names, said)
-        if name in goals:
+def _targets(texts: Iterable[str]) -> dict[str, float]:
+    """What was said, name by name."""
+    said: dict[str, float] = {}
+    for text in texts:
+        name, position = _target(text)
+        if name in said:
             raise click.BadParameter(f"{name} is named twice: give each servo one position", param_hint="NAME=POSITION")
-        goals[name] = position
+        said[name] = position
+    return said
+
+
+def _full(said: Mapping[str, float], full: Callable[[str], str]) -> dict[str, float]:
+    """By full name."""
+    goals: dict[str, float] = {}
+    for name, position in said.items():
+        if full(name) in goals:
+            raise click.BadParameter(f"{full(name)} is named twice: give each servo one position", param_hint="NAME=POSITION")
+        goals[full(name)] = position
+    return goals
+
+
+def _refuse(config: Config, goals: Mapping[str, float], speed: float | None, duration: float | None) -> None:
+    """What no servo of that kind may do, while nothing is energised yet: LimitError, UnknownName, NotSupported."""
+    for name, position in goals.items():
         bus, servo = config.names[name]
         options = config.buses[bus]
         try:
@@ -83,7 +107,6 @@ def _goals(config: Config, targets: Iterable[str], speed: float | None, duration
             PROTOCOLS[options.protocol].driver(options, config.models[bus]).check_goal(ServoGoal(servo, goal))
         except ServobusError as error:
             raise error.at(bus=bus) from None
-    return goals
 
 
 def _target(text: str) -> tuple[str, float]:
@@ -96,10 +119,16 @@ def _target(text: str) -> tuple[str, float]:
         raise LimitError(f"{text}: {position!r} is no number: nothing was sent") from None
 
 
-def _on_exit(config: Config, name: str) -> str:
-    """What becomes of it when this command ends."""
-    bus, servo = config.names[name]
-    return config.buses[bus].servos[servo].on_exit
+def _then(rig: Rig, name: str) -> str:
+    """What becomes of it when this command ends: its `on_exit`, or nothing, where a daemon keeps it."""
+    if not isinstance(rig, LocalRig):
+        return "stays"
+    bus, servo = rig.config.names[name]
+    return rig.config.buses[bus].servos[servo].on_exit
+
+
+def _words(rig: Rig, name: str) -> str:
+    return THEN[_then(rig, name)]
 
 
 @click.command()
@@ -108,7 +137,7 @@ def _on_exit(config: Config, name: str) -> str:
 def enable(options: Options, names: tuple[str, ...]) -> int:
     """Energise servos where they stand: the present position becomes the goal, then torque goes on. All if none is named.
 
-    No daemon runs, so they are at once left as their `on_exit` says: with hold they stay energised.
+    A daemon keeps them so. Without one they are at once left as their `on_exit` says: with hold they stay energised.
 
     Example: servobus enable elbow
     """
@@ -119,11 +148,9 @@ def enable(options: Options, names: tuple[str, ...]) -> int:
             await rig.enable(*names)
             done = rig.full_names(names)
             if options.as_json:
-                emit({name: {"enabled": True, "then": _on_exit(rig.config, name)} for name in done})
+                emit({name: {"enabled": True, "then": _then(rig, name)} for name in done})
             else:
-                echo_table(
-                    None, ("servo", "state", "then"), [(name, "enabled", THEN[_on_exit(rig.config, name)]) for name in done]
-                )
+                echo_table(None, ("servo", "state", "then"), [(name, "enabled", _words(rig, name)) for name in done])
             return 0
 
     return run(main)
@@ -157,7 +184,8 @@ def disable(options: Options, names: tuple[str, ...]) -> int:
 def stop(options: Options) -> int:
     """E-stop: every servo of every bus stops as its `on_estop` says; what was limp stays limp. Tells what each confirmed.
 
-    A bus whose port cannot be opened does not keep the others from being stopped. Status 1 unless all confirmed.
+    A daemon latches it until `servobus clear`. A bus whose port cannot be opened does not keep the others from being stopped.
+    Status 1 unless all confirmed.
 
     Example: servobus stop
     """
@@ -166,7 +194,8 @@ def stop(options: Options) -> int:
     async def main() -> int:
         async with opened(options, degraded=True) as rig:
             reports = await rig.stop()
-            click.echo(NOT_LATCHED, err=True)
+            if isinstance(rig, LocalRig):
+                click.echo(NOT_LATCHED, err=True)
             if options.as_json:
                 emit(reports)
             else:
@@ -187,5 +216,20 @@ def clear(options: Options) -> int:
 
     Example: servobus clear
     """
-    buses = ", ".join(options.setup.buses)
-    raise NotSupported(f"no e-stop is latched on {buses}: no daemon runs (`servobus run`), and only a daemon latches one")
+    logs()
+
+    def refuse(config: Config) -> None:
+        buses = ", ".join(config.buses)
+        raise NotSupported(f"no e-stop is latched on {buses}: no daemon runs (`servobus run`), and only a daemon latches one")
+
+    async def main() -> int:
+        async with opened(options, before=refuse) as rig:
+            was = rig.stopped
+            await rig.clear()
+            if options.as_json:
+                emit({"released": was})
+            else:
+                click.echo("the e-stop is released: enable and move again" if was else "no e-stop was latched")
+            return 0
+
+    return run(main)

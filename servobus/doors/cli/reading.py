@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Any
 
 import click
 
 from servobus.config import Config
-from servobus.doors.cli.common import STATE_COLUMNS, Options, echo_table, emit, logs, opened, run, servo_options, show, state_row
+from servobus.doors.cli.common import STATE_COLUMNS, echo_table, emit, logs, run, show, state_row
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.errors import ServobusError
-from servobus.local import LocalRig
 from servobus.protocols.table import PROTOCOLS
-from servobus.rig import full_name
+from servobus.rig import Rig, full_name
 
 
 @click.command()
@@ -40,12 +40,12 @@ def ping(options: Options, names: tuple[str, ...]) -> int:
     return run(main)
 
 
-def _health(rig: LocalRig, name: str) -> str:
+def _health(rig: Rig, name: str) -> str:
     faults = rig.snapshot()[name].faults
     return f"there, but {', '.join(faults)}" if faults else "there"
 
 
-async def _each(rig: LocalRig, names: tuple[str, ...], verb: Callable[[str], Awaitable[Any]]) -> dict[str, Any]:
+async def _each(rig: Rig, names: tuple[str, ...], verb: Callable[[str], Awaitable[Any]]) -> dict[str, Any]:
     """The answer or the error of each servo."""
     answers: dict[str, Any] = {}
     for name in rig.full_names(names):
@@ -80,7 +80,7 @@ def read(options: Options, name: str | None, register: str | None, raw: bool) ->
     return run(main)
 
 
-async def _read_register(rig: LocalRig, options: Options, name: str, register: str, raw: bool) -> int:
+async def _read_register(rig: Rig, options: Options, name: str, register: str, raw: bool) -> int:
     value = await rig.read_register(name, register, raw=raw)
     if options.as_json:
         emit({name: {register: value}})
@@ -89,7 +89,7 @@ async def _read_register(rig: LocalRig, options: Options, name: str, register: s
     return 0
 
 
-async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) -> int:
+async def _read_states(rig: Rig, options: Options, names: tuple[str, ...]) -> int:
     answers = await _each(rig, names, rig.read)
     failed = {name: answer for name, answer in answers.items() if isinstance(answer, ServobusError)}
     if options.as_json:
@@ -110,17 +110,21 @@ async def _read_states(rig: LocalRig, options: Options, names: tuple[str, ...]) 
 @click.option("--persist", is_flag=True, help="Allow EEPROM registers: they are unlocked, written, read back and locked again.")
 @servo_options
 def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, persist: bool) -> int:
-    """Write registers of one servo, and read back what they hold then. All are checked before the first is written.
+    """Write registers of one servo, and read back what they hold then. Without a daemon all are checked before the first is
+    written; a daemon checks each when its turn comes.
 
     Goals, torque and lock are not written by hand: use move, enable and disable.
 
     Example: servobus write elbow torque_limit=60
     """
     logs()
-    wanted = _wanted(options.setup, name, assignments, raw=raw, persist=persist)
+    wanted = _wanted(assignments)
+
+    def refuse(config: Config) -> None:
+        _refuse(config, name, wanted, raw=raw, persist=persist)
 
     async def main() -> int:
-        async with opened(options, [name]) as rig:
+        async with opened(options, [name], before=refuse) as rig:
             full = rig.full_name(name)
             found = {
                 register: await rig.write_register(full, register, value, raw=raw, persist=persist)
@@ -136,21 +140,26 @@ def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, 
     return run(main)
 
 
-def _wanted(config: Config, name: str, assignments: Iterable[str], *, raw: bool, persist: bool) -> dict[str, Any]:
-    """Register -> value. All are checked before the first is written: LimitError, UnknownName, NotSupported."""
-    bus, servo = config.names[full_name(config.names, name)]
-    options = config.buses[bus]
-    driver = PROTOCOLS[options.protocol].driver(options, config.models[bus])
+def _wanted(assignments: Iterable[str]) -> dict[str, Any]:
+    """Register -> value."""
     wanted: dict[str, Any] = {}
     for register, value in map(_assignment, assignments):
         if register in wanted:
             raise click.BadParameter(f"{register} is named twice: give each register one value", param_hint="REGISTER=VALUE")
         wanted[register] = value
+    return wanted
+
+
+def _refuse(config: Config, name: str, wanted: Mapping[str, Any], *, raw: bool, persist: bool) -> None:
+    """Before the first is written: LimitError, UnknownName, NotSupported."""
+    bus, servo = config.names[full_name(config.names, name)]
+    options = config.buses[bus]
+    driver = PROTOCOLS[options.protocol].driver(options, config.models[bus])
+    for register, value in wanted.items():
         try:
             driver.write_register(servo, register, value, raw=raw, persist=persist).close()
         except ServobusError as error:
             raise error.at(bus=bus, servo=servo) from None
-    return wanted
 
 
 def _assignment(text: str) -> tuple[str, Any]:

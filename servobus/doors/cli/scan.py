@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import click
@@ -15,18 +16,28 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
+from servobus.client import RemoteRig
 from servobus.config import Config, parse_config
-from servobus.doors.cli.common import Options, echo_table, emit, logs, run, servo_options, simulated, traced
+from servobus.doors.cli.common import echo_table, emit, logs, run
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.errors import ServobusError, UnknownName
-from servobus.opening import open_rig
 from servobus.protocols.table import PROTOCOLS
-from servobus.rig import Found
+from servobus.rig import Found, Rig
 
 INTERRUPTED, NONE_FOUND = 130, 1
 LEAST_RATE, GREATEST_RATE = 300, 10_000_000
 BUS = "line"
 """What the bus of a bare port is called."""
 HEAD = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
+
+
+@dataclass(frozen=True)
+class Line:
+    """What is scanned."""
+
+    name: str
+    protocol: str
+    port: str
 
 
 @click.command()
@@ -42,7 +53,7 @@ HEAD = "# Written by `servobus scan --yaml`. Give the servos names of yours, and
 def scan(
     options: Options, bus: str | None, port: str | None, protocol: str, rates: str | None, ids: str | None, as_yaml: bool
 ) -> int:
-    """Ask every id, at every rate wanted, who is there. Needs the line alone; moves and writes nothing.
+    """Ask every id, at every rate wanted, who is there. Polls rest meanwhile; moves and writes nothing.
 
     Ctrl-C ends it early and tells what was found until then. Status 1 when nobody answered.
 
@@ -51,41 +62,83 @@ def scan(
     if port and bus:
         raise click.UsageError(f"say a bus of the config ({bus}) or --port, not both")
     logs()
-    config = _bare(port, protocol, rates) if port else options.setup
-    if port and options.dry_run:
-        config = simulated(config)
-    name = _bus_name(config, BUS if port else bus)
-    entry = PROTOCOLS[config.buses[name].protocol]
-    found: list[Found] = []
+    search = Search(options, bus, port, protocol, rates, ids)
     try:
-        status = _scan(options, config, name, _rates(rates, entry.baudrates, bool(port)), _ids(ids, entry.scan_ids), found)
+        status = search.run()
     except ServobusError:
-        if found:
-            _tell(options, config, name, found, as_yaml)
+        if search.found:
+            _tell(options, search.line, search.found, as_yaml)
         raise
-    _tell(options, config, name, found, as_yaml)
-    return status or (0 if found else NONE_FOUND)
+    _tell(options, search.line, search.found, as_yaml)
+    return status or (0 if search.found else NONE_FOUND)
 
 
-def _scan(options: Options, config: Config, name: str, rates: list[int], ids: list[int], found: list[Found]) -> int:
-    """Fills `found`; returns the status of an interrupted scan, else 0."""
+class Search:
+    """One scan: what was asked for, and what was found so far."""
 
-    async def main() -> None:
-        async with traced(config, options) as trace, open_rig(config, buses=[name], trace=trace) as rig:
+    def __init__(
+        self, options: Options, bus: str | None, port: str | None, protocol: str, rates: str | None, ids: str | None
+    ) -> None:
+        self.found: list[Found] = []
+        self._options = options
+        self._bus = bus
+        self._rates = rates
+        self._ids = ids
+        self._bare = bool(port)
+        self.line = Line(BUS, protocol, port) if port else Line("", "", "")
+        """Known from the beginning with a bare port; else when a rig is reached."""
+
+    def run(self) -> int:
+        """Returns the status of an interrupted scan, else 0."""
+        try:
+            run(self._run)
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        return 0
+
+    async def _run(self) -> None:
+        async with self._rig() as rig:
+            entry = PROTOCOLS[self.line.protocol]
+            rates, ids = _rates(self._rates, entry.baudrates, self._bare), _ids(self._ids, entry.scan_ids)
             with _progress() as told:
 
                 def progress(asked: int, count: int, hit: Found | None) -> None:
                     if hit is not None:
-                        found.append(hit)
-                    told(asked, count, len(found))
+                        self.found.append(hit)
+                    told(asked, count, len(self.found))
 
-                await rig.scan(name, baudrates=rates, ids=ids, progress=progress)
+                await rig.scan(self.line.name, baudrates=rates, ids=ids, progress=progress)
 
-    try:
-        run(main)
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    return 0
+    @asynccontextmanager
+    async def _rig(self) -> AsyncIterator[Rig]:
+        """What has the line: this process for a bare port, else as for every command."""
+        if self._bare:
+            options = replace(self._options, bare=_bare(self.line, self._rates), direct=True)
+            async with opened(options, before=self._check) as rig:
+                yield rig
+            return
+        only = [] if self._bus is None else [self._bus]
+        async with opened(self._options, only=only, before=self._check) as rig:
+            if isinstance(rig, RemoteRig):
+                buses = (await rig.config())["buses"]
+                self._choose({name: Line(name, bus["protocol"], bus["port"]) for name, bus in buses.items()})
+            yield rig
+
+    def _check(self, config: Config) -> None:
+        """Before a port is opened: UnknownName, BadParameter."""
+        self._choose({name: Line(name, bus.protocol, bus.port) for name, bus in config.buses.items()})
+        entry = PROTOCOLS[self.line.protocol]
+        _rates(self._rates, entry.baudrates, self._bare)
+        _ids(self._ids, entry.scan_ids)
+
+    def _choose(self, lines: Mapping[str, Line]) -> None:
+        if self._bus is None and len(lines) == 1:
+            (self.line,) = lines.values()
+        elif self._bus is None or self._bus not in lines:
+            said = "say which bus" if self._bus is None else f"no bus {self._bus!r}"
+            raise UnknownName(f"{said}: there are {', '.join(lines)}")
+        else:
+            self.line = lines[self._bus]
 
 
 @contextmanager
@@ -106,23 +159,14 @@ def _progress() -> Iterator[Any]:
         yield lambda asked, count, found: bar.update(task, completed=asked, total=count, found=found)
 
 
-def _bare(port: str, protocol: str, rates: str | None) -> Config:
+def _bare(line: Line, rates: str | None) -> Config:
     """A config of one line without servos."""
-    if protocol not in PROTOCOLS:
-        raise UnknownName(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
-    first = _rates(rates, PROTOCOLS[protocol].baudrates, True)[0]
-    quoted = "'" + port.replace("'", "''") + "'"
-    text = f"version: 1\nbuses:\n  {BUS}: {{protocol: {protocol}, port: {quoted}, baudrate: {first}}}\n"
+    if line.protocol not in PROTOCOLS:
+        raise UnknownName(f"no protocol {line.protocol!r}: there are {', '.join(PROTOCOLS)}")
+    first = _rates(rates, PROTOCOLS[line.protocol].baudrates, True)[0]
+    quoted = "'" + line.port.replace("'", "''") + "'"
+    text = f"version: 1\nbuses:\n  {line.name}: {{protocol: {line.protocol}, port: {quoted}, baudrate: {first}}}\n"
     return parse_config(text, "--port")
-
-
-def _bus_name(config: Config, bus: str | None) -> str:
-    if bus is None and len(config.buses) == 1:
-        return next(iter(config.buses))
-    if bus is None or bus not in config.buses:
-        said = "say which bus" if bus is None else f"no bus {bus!r}"
-        raise UnknownName(f"{said}: there are {', '.join(config.buses)}")
-    return bus
 
 
 def _rates(text: str | None, known: tuple[int, ...], bare: bool) -> list[int]:
@@ -156,35 +200,34 @@ def _ids(text: str | None, known: range) -> list[int]:
     return list(range(low, high + 1))
 
 
-def _tell(options: Options, config: Config, name: str, found: list[Found], as_yaml: bool) -> None:
+def _tell(options: Options, line: Line, found: list[Found], as_yaml: bool) -> None:
     if options.as_json:
         emit([dataclasses.asdict(hit) for hit in found])
     elif not found:
         click.echo("nobody answered: is the power on, are the baud rates right, is another program on the line?", err=True)
     elif as_yaml:
-        click.echo(starter(config, name, found), nl=False)
+        click.echo(starter(line, found), nl=False)
     else:
         rows = [(hit.id, hit.baudrate, hit.model, hit.product, hit.firmware, hit.note or None) for hit in found]
         echo_table(None, ("id", "baud rate", "model", "product", "firmware", "note"), rows)
 
 
-def starter(config: Config, name: str, found: list[Found]) -> str:
+def starter(line: Line, found: list[Found]) -> str:
     """A config of what was found, that `check` accepts. A line has one rate, and a servo needs a model: what stands against
     that is told in comments."""
-    options = config.buses[name]
     rate = max((hit.baudrate for hit in found), key=lambda rate: sum(hit.baudrate == rate for hit in found))
     usable = [hit for hit in found if hit.baudrate == rate and hit.model]
-    write = PROTOCOLS[options.protocol].starter
+    write = PROTOCOLS[line.protocol].starter
     entries = (entry for hit in usable for entry in write(hit.id, hit.model or "").items())
     servos = CommentedMap((servo, CommentedMap(keys)) for servo, keys in entries)
     for servo in servos.values():
         servo.fa.set_flow_style()
-    bus = CommentedMap(protocol=options.protocol, port=options.port, baudrate=rate, poll=CommentedMap(feedback=20), servos=servos)
+    bus = CommentedMap(protocol=line.protocol, port=line.port, baudrate=rate, poll=CommentedMap(feedback=20), servos=servos)
     bus["poll"].fa.set_flow_style()
     if not servos:
         servos.fa.set_flow_style()
     text = io.StringIO()
-    YAML().dump(CommentedMap(version=1, buses=CommentedMap({name: bus})), text)
+    YAML().dump(CommentedMap(version=1, buses=CommentedMap({line.name: bus})), text)
     notes = "".join(
         f"# Not in it: id {hit.id} at {hit.baudrate} baud, {_why_not(hit, rate)}\n" for hit in found if hit not in usable
     )

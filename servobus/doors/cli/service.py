@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
+import signal
 from pathlib import Path
 
 import anyio
@@ -13,8 +13,8 @@ import structlog
 from servobus.config import load_config
 from servobus.doors.cli.common import Number, logs
 from servobus.doors.cli.common import run as run_loop
-from servobus.local import LocalRig
-from servobus.opening import open_rig
+from servobus.doors.daemon.main import serve_rig
+from servobus.rpc.place import socket_path
 from servobus.sim.serve import serve
 
 log = structlog.get_logger("servobus")
@@ -24,45 +24,21 @@ log = structlog.get_logger("servobus")
 @click.argument("config", metavar="CONFIG")
 @click.option("--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between two lines of state.")
 def run(config: str, log_every: float) -> None:
-    """Own the ports of CONFIG until SIGTERM or Ctrl-C.
+    """Own the ports of CONFIG until SIGTERM or Ctrl-C, and let other programs in.
 
     Polls at the config's rates, waits for ports that are missing, logs what happens on standard error (JSON when that is no
-    terminal). Writes nothing at start. At the end each servo that was enabled is left as its `on_exit` says.
+    terminal). Writes nothing at start. Commands and `servobus.connect()` find it by its socket: SERVOBUS_SOCKET, else in
+    $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/servobus or /run/servobus. SIGHUP reads CONFIG anew. At the end each servo that was
+    enabled is left as its `on_exit` says.
 
     Example: servobus run config/arm.yaml
     """
     logs(logging.INFO)
-    setup = load_config(config)
-
-    async def main() -> None:
-        async with open_rig(setup, degraded=True) as rig:
-            log.info("running", config=config, buses=list(rig.buses))
-            while True:
-                await asyncio.sleep(log_every)
-                _log_state(rig)
-
+    load_config(config)  # what is wrong with it is told before anything is claimed
     try:
-        run_loop(main, terminated=0)
+        run_loop(lambda: serve_rig(config, socket_path(), log_every), terminated=0, endings=[signal.SIGTERM])
     finally:
         log.info("ended")
-
-
-def _log_state(rig: LocalRig) -> None:
-    """One line for each bus."""
-    stats, snapshot = rig.stats(), rig.snapshot()
-    for bus, counts in stats.items():
-        servos = {name.partition("/")[2]: state for name, state in snapshot.items() if rig.names[name][0] == bus}
-        log.info(
-            "state",
-            bus=bus,
-            up=counts["up"],
-            load_percent=counts["wire_load_percent"],
-            turn_p99_ms=counts["turn_ms"]["p99"],
-            timeouts=counts.get("timeouts", 0),
-            positions={name: state.position for name, state in servos.items()},
-            not_online=[name for name, state in servos.items() if state.health != "online"],
-            faults={name: list(state.faults) for name, state in servos.items() if state.faults},
-        )
 
 
 @click.command()

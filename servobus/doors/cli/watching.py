@@ -12,22 +12,21 @@ import click
 from rich.console import Console
 from rich.live import Live
 
+from servobus.client import RemoteRig
 from servobus.doors.cli.common import (
     STATE_COLUMNS,
     Number,
-    Options,
     echo_table,
     emit,
     logs,
-    opened,
     run,
-    servo_options,
     show,
     state_row,
     table,
 )
+from servobus.doors.cli.reach import Options, opened, servo_options
 from servobus.local import LocalRig
-from servobus.rig import Snapshot
+from servobus.rig import Rig, Snapshot
 
 MOST_HZ = 50.0
 
@@ -80,8 +79,17 @@ def _picture(snapshot: Snapshot) -> Any:
     return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()], narrow=True)
 
 
-async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | None, tell: Callable[[Snapshot], None]) -> None:
-    unpolled = [name for name in names if not rig.config.buses[rig.names[name][0]].poll.rates()]
+async def _unpolled(rig: Rig, names: list[str]) -> list[str]:
+    """Those whose state nobody else keeps fresh."""
+    if isinstance(rig, RemoteRig):
+        polled = {bus: any((data["poll"] or {}).values()) for bus, data in (await rig.config())["buses"].items()}
+    elif isinstance(rig, LocalRig):
+        polled = {bus: bool(options.poll.rates()) for bus, options in rig.config.buses.items()}
+    return [name for name in names if not polled[rig.names[name][0]]]
+
+
+async def _pictures(rig: Rig, names: list[str], hz: float, count: int | None, tell: Callable[[Snapshot], None]) -> None:
+    unpolled = await _unpolled(rig, names)
     taken = 0
     async for _ in rig.watch(hz):
         await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
@@ -93,10 +101,10 @@ async def _pictures(rig: LocalRig, names: list[str], hz: float, count: int | Non
 
 
 @click.command()
-@click.option("--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="How long to count.")
+@click.option("--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="How long to count without a daemon.")
 @servo_options
 def stats(options: Options, seconds: float) -> int:
-    """Poll as the config says for a while, and tell what the lines carried and how long turns took.
+    """Tell what the lines carried and how long turns took: of a daemon since its start; without one, after polling for a while.
 
     Example: servobus stats --seconds 10
     """
@@ -104,7 +112,8 @@ def stats(options: Options, seconds: float) -> int:
 
     async def main() -> int:
         async with opened(options) as rig:
-            await asyncio.sleep(seconds)
+            if isinstance(rig, LocalRig):
+                await asyncio.sleep(seconds)
             found = rig.stats()
             if options.as_json:
                 emit(found)

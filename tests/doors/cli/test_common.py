@@ -7,8 +7,11 @@ from typing import cast
 
 import pytest
 
-from servobus.doors.cli.common import Options, opened, show, table
+from servobus.doors.cli.common import show, table
+from servobus.doors.cli.reach import Options, opened
 from servobus.errors import DeviceError
+from servobus.local import LocalRig
+from servobus.rig import Rig
 from servobus.sim.build import SimLink
 from tests.config_mistakes import GOOD
 
@@ -20,11 +23,16 @@ def options(tmp_path: Path) -> Options:
     return Options(str(path), as_json=False, trace=False, dry_run=False)
 
 
+def silence(rig: Rig) -> None:
+    """From here on nobody answers."""
+    cast("SimLink", cast("LocalRig", rig).keepers["arm"].link).line.close()
+
+
 async def test_how_servos_were_left_is_told_when_nobody_confirms_it(options: Options) -> None:
     with pytest.raises(DeviceError, match=r"how it was left: arm/shoulder \(hold: .+\); look") as caught:  # noqa: PT012 - at the end
         async with opened(options, ["shoulder"]) as rig:
             await rig.enable("shoulder")
-            cast("SimLink", rig.keepers["arm"].link).line.close()  # from here on nobody answers
+            silence(rig)
     assert caught.value.exit_status == 1
 
 
@@ -32,14 +40,14 @@ async def test_what_went_wrong_before_is_told_first(options: Options) -> None:
     with pytest.raises(ValueError, match="first"):  # noqa: PT012 - it is raised by the last statement
         async with opened(options, ["shoulder"]) as rig:
             await rig.enable("shoulder")
-            cast("SimLink", rig.keepers["arm"].link).line.close()
+            silence(rig)
             raise ValueError("first")
 
 
 async def test_servos_that_confirm_how_they_are_left(options: Options) -> None:
     async with opened(options) as rig:
         await rig.enable()
-    assert {name: (report.action, report.confirmed) for name, report in rig.left.items()} == {
+    assert {name: (report.action, report.confirmed) for name, report in cast("LocalRig", rig).left.items()} == {
         "arm/shoulder": ("hold", True),
         "arm/elbow": ("hold", True),
     }

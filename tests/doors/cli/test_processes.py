@@ -119,10 +119,15 @@ def test_a_simulator_and_a_daemon_on_its_port(rig: str, tmp_path: Path) -> None:
         real.write_text(LIMP.replace('"sim:"', path))
         with servobus("run", str(real)) as daemon:
             until(daemon, "running")
-            with servobus("read", "-c", str(real)) as second:
+            with servobus("read", "-c", str(real)) as client:
+                told, _ = client.communicate(timeout=20)
+                assert client.returncode == 0
+                assert "shoulder" in told, "the daemon was asked"
+            with servobus("read", "-c", str(real), "--direct") as second:
                 _, told = second.communicate(timeout=20)
                 assert second.returncode == 1
                 assert f"process {daemon.pid}" in told
+                assert f"the servobus daemon (pid {daemon.pid}) owns it: leave --direct out" in told
             sim.kill()
             assert until(daemon, "line_down")["bus"] == "arm"
             daemon.terminate()

@@ -1,0 +1,142 @@
+"""Lines and what they say: framing, JSON within limits, calls and their parameters. Pure.
+
+A line is looked at before it is parsed: how deep it is, and that no key stands in it twice, for then two readers would understand
+two things.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import accumulate
+from typing import Any
+
+import msgspec
+
+from servobus.errors import ServobusError
+from servobus.rpc.errors import INTERNAL, INVALID_PARAMS, INVALID_REQUEST, NO_METHOD, PARSE, encoded
+from servobus.rpc.methods import MAX_BATCH, MAX_DEPTH, MAX_LINE, METHODS, Params
+
+STRING = re.compile(rb'"(?:[^"\\]|\\.)*"')
+STEP = {ord("{"): 1, ord("["): 1, ord("}"): -1, ord("]"): -1}
+encode = msgspec.json.Encoder().encode
+_decode = msgspec.json.Decoder().decode
+NO_ID = object()
+"""Of a notification: nobody waits for its answer."""
+
+
+class Refused(Exception):
+    """What is wrong with a message, as JSON-RPC says it."""
+
+    def __init__(self, code: int, message: str, call_id: Any = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.call_id = call_id
+
+    def answer(self) -> bytes:
+        return failed(self.call_id, {"code": self.code, "message": str(self)})
+
+
+class Call:
+    """One request or notification."""
+
+    __slots__ = ("id", "method", "params")
+
+    def __init__(self, method: str, params: Params, call_id: Any) -> None:
+        self.method = method
+        self.params = params
+        self.id = call_id
+
+    @property
+    def wants_answer(self) -> bool:
+        return self.id is not NO_ID
+
+
+class Framer:
+    """Cuts a stream into lines. Memory is bounded by one line."""
+
+    def __init__(self, limit: int = MAX_LINE) -> None:
+        self._buffer = b""
+        self._limit = limit
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The lines that are whole now. Raises Refused for one that is too long."""
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        if len(self._buffer) >= self._limit or any(len(line) >= self._limit for line in lines):
+            raise Refused(INVALID_REQUEST, f"a line has at most {self._limit} bytes")
+        return lines
+
+
+def parse(line: bytes) -> list[Any]:
+    """The messages of a line, not looked at yet. Raises Refused."""
+    bare = STRING.sub(b"", line)
+    opened = bare.count(b"{") + bare.count(b"[")
+    if opened > MAX_DEPTH and max(accumulate(STEP.get(byte, 0) for byte in bare)) > MAX_DEPTH:
+        raise Refused(PARSE, f"more than {MAX_DEPTH} levels deep")
+    try:
+        message = _decode(line)
+    except (ValueError, RecursionError):
+        raise Refused(PARSE, "this is no JSON: one object, or an array of them, a line") from None
+    if bare.count(b":") != _keys(message):
+        raise Refused(PARSE, "a key stands twice in one object: say it once")
+    if not isinstance(message, list):
+        return [message]
+    if not 1 <= len(message) <= MAX_BATCH:
+        raise Refused(INVALID_REQUEST, f"a batch has 1 to {MAX_BATCH} calls")
+    return message
+
+
+def _keys(value: Any) -> int:
+    if isinstance(value, dict):
+        return len(value) + sum(map(_keys, value.values()))
+    return sum(map(_keys, value)) if isinstance(value, list) else 0
+
+
+def call_of(message: Any) -> Call:
+    """Raises Refused, with the id to answer to where there is one."""
+    if not isinstance(message, dict):
+        raise Refused(INVALID_REQUEST, "a call is an object with jsonrpc, method, params and id")
+    call_id = message.get("id", NO_ID)
+    if call_id is not NO_ID and (isinstance(call_id, bool) or not isinstance(call_id, (str, int, float, type(None)))):
+        raise Refused(INVALID_REQUEST, "an id is a string, a number or null")
+    told = None if call_id is NO_ID else call_id
+    if message.get("jsonrpc") != "2.0" or message.keys() - {"jsonrpc", "method", "params", "id"}:
+        raise Refused(INVALID_REQUEST, 'a call is {"jsonrpc":"2.0","method":...,"params":{...},"id":...} and nothing else', told)
+    name = message.get("method")
+    method = METHODS.get(name) if isinstance(name, str) else None
+    if method is None or not isinstance(name, str):
+        raise Refused(NO_METHOD, f"no such method; there are {', '.join(METHODS)}", told)
+    return Call(name, _params(method.params, message.get("params", {}), told), call_id)
+
+
+def _params(kind: type[Params], found: Any, told: Any) -> Params:
+    if isinstance(found, list):
+        fields = kind.__struct_fields__
+        if len(found) > len(fields):
+            raise Refused(INVALID_PARAMS, f"params: at most {', '.join(fields) or 'none'}", told)
+        found = dict(zip(fields, found, strict=False))
+    try:
+        return msgspec.convert(found, kind)
+    except msgspec.ValidationError as error:
+        raise Refused(INVALID_PARAMS, f"params: {error}; there are {', '.join(kind.__struct_fields__) or 'none'}", told) from None
+
+
+def answered(call_id: Any, result: Any) -> bytes:
+    return b'{"jsonrpc":"2.0","id":%b,"result":%b}' % (encode(call_id), encode(result))
+
+
+def failed(call_id: Any, error: dict[str, Any]) -> bytes:
+    return b'{"jsonrpc":"2.0","id":%b,"error":%b}' % (encode(call_id), encode(error))
+
+
+def failure(call_id: Any, error: BaseException) -> bytes:
+    """What went wrong while a call was done."""
+    if isinstance(error, ServobusError):
+        return failed(call_id, encoded(error))
+    if isinstance(error, (ValueError, TypeError)):
+        return failed(call_id, {"code": INVALID_PARAMS, "message": str(error)})
+    return failed(call_id, {"code": INTERNAL, "message": "a mistake in the daemon: its log has more"})
+
+
+def notification(method: str, params: bytes) -> bytes:
+    """`params` is JSON already."""
+    return b'{"jsonrpc":"2.0","method":%b,"params":%b}\n' % (encode(method), params)
