@@ -46,12 +46,17 @@ def decoded(error: Any) -> Exception:
     if not isinstance(data, dict) or not isinstance(data.get("type"), str):
         return ServobusError(f"the daemon could not do it: {message}")
     kind = TYPES.get(data["type"], ServobusError)
-    where: dict[str, Any] = {"bus": data.get("bus"), "servo": data.get("servo"), "raw": _bytes(data.get("raw"))}
+    where: dict[str, Any] = {key: str(data[key]) for key in ("bus", "servo") if data.get(key)} | {"raw": _bytes(data.get("raw"))}
     if kind is PartialFailure:
-        return PartialFailure({name: _unresult(result) for name, result in dict(data.get("results", {})).items()}, **where)
+        results = data.get("results")
+        return PartialFailure(
+            {name: _unresult(one) for name, one in results.items()} if isinstance(results, dict) else {}, **where
+        )
+    said = str(data.get("message", message))
     if issubclass(kind, DeviceError):
-        return kind(data.get("message", message), code=data.get("code"), **where)
-    return kind(data.get("message", message), **where)
+        number = data.get("code")
+        return kind(said, code=number if isinstance(number, int) else None, **where)
+    return kind(said, **where)
 
 
 def _bytes(text: Any) -> bytes:

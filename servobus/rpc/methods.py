@@ -10,9 +10,9 @@ from typing import Any
 
 import msgspec
 
-from servobus.access import Role
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Reload
+from servobus.roles import Role
 
 PROTOCOL = 1
 """Of these messages: a client of another one is told so at `hello`."""
