@@ -106,16 +106,14 @@ class Listening(Rig):
         now = self._clock()
         return {name: received(state, now) for name, state in states.items()}
 
-    def _seen(self, told: dict[str, Any]) -> None:
+    def _seen(self, told: dict[str, Any]) -> Snapshot:
         """A state notice."""
-        states = self._states(told)
-        self._mirror.stopped = bool(told.get("stopped"))
+        states = self._received(msgspec.convert(told["states"], Snapshot))
+        self._mirror.stopped = bool(told["stopped"])
         self._mirror.know(states)
         if states.keys() != self._mirror.names.keys() and (self._renaming is None or self._renaming.done()):
             self._renaming = asyncio.create_task(self._rename())  # the config was read anew
-
-    def _states(self, told: dict[str, Any]) -> Snapshot:
-        return self._received(msgspec.convert(told["states"], Snapshot))
+        return states
 
     async def _rename(self) -> None:
         with suppress(ServobusError):  # the next notice asks again
@@ -134,7 +132,7 @@ class Listening(Rig):
                 yield snapshot
         newest = Newest()
         subscription = await self._session.subscribe(
-            {"topic": "state", "hz": min(hz, MOST_HZ)}, lambda told: newest.put(self._states(told))
+            {"topic": "state", "hz": min(hz, MOST_HZ)}, lambda told: newest.put(self._seen(told))
         )
         self._watching.add(newest)
         try:

@@ -31,7 +31,7 @@ class Subscription:
     """Wanted until it is given up, over all connections; `sink` gets the parameters of each notice."""
 
     params: dict[str, Any]
-    sink: Callable[[dict[str, Any]], None]
+    sink: Callable[[dict[str, Any]], object]
     numbers: set[int] = field(default_factory=set)
     """As the present connection calls it."""
 
@@ -110,11 +110,11 @@ class Session:
             raise LinkDown(f"{self._down.message}; nothing was sent" + ("" if self._closed else ", it is tried again by itself"))
         return self._wire
 
-    def want(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], None]) -> None:
+    def want(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], object]) -> None:
         """A subscription that begins with every connection, the first too."""
         self._subscriptions.add(Subscription(params, sink))
 
-    async def subscribe(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], None]) -> Subscription:
+    async def subscribe(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], object]) -> Subscription:
         """From now on, and again with every new connection."""
         subscription = Subscription(params, sink)
         self._subscriptions.add(subscription)

@@ -31,7 +31,7 @@ class _Message(msgspec.Struct):
     id: int | None = None
     method: str | None = None
     params: msgspec.Raw = msgspec.Raw()
-    result: msgspec.Raw | None = None
+    result: msgspec.Raw = msgspec.Raw()
     error: Any = None
 
 
@@ -128,7 +128,7 @@ class Wire(asyncio.Protocol):
     def _answered(self, number: int, message: _Message) -> None:
         call = self._calls[number]
         if message.error is None:
-            if message.result is None:
+            if not message.result:
                 raise ValueError(f"no result for {call.method}")
             value = _result(call.method)(message.result)
             value = call.then(value) if call.then else value
