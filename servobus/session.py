@@ -57,7 +57,8 @@ class Session:
         self._progress = progress
         self._wire: Wire | None = None
         self._down = LinkDown(f"{place}: not connected yet")
-        self._subscriptions: set[Subscription] = set()
+        self._subscriptions: dict[Subscription, None] = {}
+        """In the order they were made."""
         self._redialing: asyncio.Task[None] | None = None
         self._watchdog: asyncio.TimerHandle | None = None
         self._closed = False
@@ -112,12 +113,12 @@ class Session:
 
     def want(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], object]) -> None:
         """A subscription that begins with every connection, the first too."""
-        self._subscriptions.add(Subscription(params, sink))
+        self._subscriptions[Subscription(params, sink)] = None
 
     async def subscribe(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], object]) -> Subscription:
         """From now on, and again with every new connection."""
         subscription = Subscription(params, sink)
-        self._subscriptions.add(subscription)
+        self._subscriptions[subscription] = None
         try:
             await self._begin(self._present(), subscription)
         except BaseException:
@@ -131,7 +132,7 @@ class Session:
         await wire.call("subscribe", subscription.params, timeout=DEADLINE, then=subscription.numbers.add)
 
     def unsubscribe(self, subscription: Subscription) -> None:
-        self._subscriptions.discard(subscription)
+        self._subscriptions.pop(subscription, None)
         for number in subscription.numbers:
             if self._wire is not None:
                 self._wire.tell("unsubscribe", {"subscription": number})

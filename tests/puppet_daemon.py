@@ -31,7 +31,7 @@ class Visitor(asyncio.Protocol):
     def __init__(self, daemon: PuppetDaemon) -> None:
         self.daemon = daemon
         self.number = len(daemon.visitors)
-        self.subscriptions: dict[str, int] = {}
+        self.subscriptions: list[tuple[str, int]] = []
         self.gone = False
         self._rest = b""
 
@@ -61,9 +61,9 @@ class Visitor(asyncio.Protocol):
 
     def notify(self, topic: str, **params: Any) -> None:
         """`topic` as in `subscribe`; the notice of `events` is called `event`."""
-        self.say(
-            {"method": topic.removesuffix("s"), "params": {"subscription": self.subscriptions[topic], "missed": 0, **params}}
-        )
+        method = "event" if topic == "events" else topic
+        for number in [number for name, number in self.subscriptions if name == topic]:
+            self.say({"method": method, "params": {"subscription": number, "missed": 0, **params}})
 
 
 NOT_FOUND = {"error": {"code": -32601, "message": "method not found"}}
@@ -74,8 +74,9 @@ def failed(kind: str, message: str, **data: Any) -> dict[str, Any]:
 
 
 def _subscribe(visitor: Visitor, message: dict[str, Any]) -> dict[str, Any]:
-    visitor.subscriptions[message["params"]["topic"]] = number = visitor.daemon.subscribed = visitor.daemon.subscribed + 1
-    return {"result": number}
+    visitor.daemon.subscribed += 1
+    visitor.subscriptions.append((message["params"]["topic"], visitor.daemon.subscribed))
+    return {"result": visitor.daemon.subscribed}
 
 
 class PuppetDaemon:
