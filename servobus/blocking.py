@@ -9,17 +9,20 @@ from __future__ import annotations
 import asyncio
 import functools
 import threading
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Coroutine, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Coroutine, Generator, Iterator, Mapping
 from concurrent.futures import CancelledError, Future
 from contextlib import AbstractAsyncContextManager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 
 from servobus import client
 from servobus.errors import LinkDown
 from servobus.events import Event
 from servobus.rig import Rig, Servo, Snapshot
+
+if TYPE_CHECKING:
+    from servobus.config import Config
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,22 +40,31 @@ class _Thread:
         self._ready: Future[Rig] = Future()
         self._failure: BaseException | None = None
         self._closing = threading.Lock()
-        self._thread = threading.Thread(target=asyncio.run, args=(self._main(rig),), name="servobus", daemon=True)
+        self._loop = asyncio.new_event_loop()
+        self._leave: asyncio.Future[None] = self._loop.create_future()
+        self._thread = threading.Thread(target=self._serve, args=(rig,), name="servobus", daemon=True)
         self._thread.start()
         try:
             self.rig = self._ready.result()
-        except BaseException:
-            self._ready.cancel()
+        except BaseException:  # it cannot be opened, or Ctrl-C came before it was
+            with suppress(RuntimeError):  # it has ended already
+                self._loop.call_soon_threadsafe(self._give_up)
+            self._thread.join()
             raise
 
+    def _serve(self, rig: Callable[[], AbstractAsyncContextManager[Rig]]) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._main(rig))
+
+    def _give_up(self) -> None:
+        for task in asyncio.all_tasks(self._loop):
+            task.cancel()
+
     async def _main(self, rig: Callable[[], AbstractAsyncContextManager[Rig]]) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._leave: asyncio.Future[None] = self._loop.create_future()
         try:
             async with rig() as opened:
-                if self._ready.set_running_or_notify_cancel():
-                    self._ready.set_result(opened)
-                    await self._leave
+                self._ready.set_result(opened)
+                await self._leave
         except _Left:
             pass
         except BaseException as error:  # noqa: BLE001 - it is raised where the rig was wanted, or is left
@@ -192,15 +204,15 @@ class BlockingRig(_Blocking[Rig]):
 
         return self._thread.run(inside())
 
-    def watch(self, hz: float = 10.0) -> Iterator[Snapshot]:
+    def watch(self, hz: float = 10.0) -> Generator[Snapshot, None, None]:
         """As `Rig.watch`, for a plain `for`."""
         return self._each(self._inner.watch(hz))
 
-    def events(self) -> Iterator[Event]:
+    def events(self) -> Generator[Event, None, None]:
         """As `Rig.events`, for a plain `for`."""
         return self._each(self._inner.events())
 
-    def _each(self, items: AsyncIterator[R]) -> Iterator[R]:
+    def _each(self, items: AsyncIterator[R]) -> Generator[R, None, None]:
         async def following() -> R:
             return await anext(items)
 
@@ -232,7 +244,7 @@ def _waiting(rig: Callable[P, AbstractAsyncContextManager[Rig]]) -> Callable[P, 
 connect = _waiting(client.connect)
 
 
-def open(config: str | Path, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
+def open(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
     """A rig whose ports this process owns: `servobus.open`."""
     from servobus.opening import open_rig  # the engine, which a client does without
 

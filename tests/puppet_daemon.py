@@ -82,6 +82,9 @@ def _subscribe(visitor: Visitor, message: dict[str, Any]) -> dict[str, Any]:
 class PuppetDaemon:
     """`answers`: method -> {"result": ...} or {"error": ...}, or a callable (visitor, message) that gives one; None: silence."""
 
+    loop: asyncio.AbstractEventLoop
+    """Once it serves."""
+
     def __init__(self) -> None:
         self.heard: list[tuple[str, dict[str, Any]]] = []
         self.visitors: list[Visitor] = []
@@ -111,7 +114,8 @@ class PuppetDaemon:
 @asynccontextmanager
 async def puppet_daemon(path: Path, daemon: PuppetDaemon | None = None) -> AsyncIterator[PuppetDaemon]:
     daemon = daemon or PuppetDaemon()
-    server = await asyncio.get_running_loop().create_unix_server(lambda: Visitor(daemon), str(path))
+    daemon.loop = asyncio.get_running_loop()
+    server = await daemon.loop.create_unix_server(lambda: Visitor(daemon), str(path))
     try:
         yield daemon
     finally:
