@@ -6,6 +6,7 @@ Motion needs its servos' leases, which it takes and keeps by itself (`holding.py
 
 from __future__ import annotations
 
+import asyncio
 import ssl
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from servobus.dial import address_of, token_of
-from servobus.errors import LimitError
+from servobus.errors import LimitError, ServobusError
 from servobus.listening import Listening
 from servobus.mirror import received
 from servobus.protocols.words import GOAL_NUMBERS, Change, Goal, Identity, Outcome, State, StopReport, is_number, no_number
@@ -110,13 +111,21 @@ class RemoteRig(Listening):
         await self._do("clear", {}, then=released)
 
     async def _do(self, method: str, params: dict[str, Any], then: Callable[[Any], Any] | None = None) -> Any:
+        """A verb after which `snapshot` is to be as it has left the servos, even when it failed for some."""
         try:
-            return await self._session.call(method, params, then=then)
-        finally:
+            result = await self._session.call(method, params, then=then)
+        except ServobusError:
             await self._refresh()
+            raise
+        await self._refresh()
+        return result
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
-        params = {"names": self.full_names(names), "tolerance": tolerance, "timeout": _bounded(timeout)}
+        params = {
+            "names": self.full_names(names),
+            "tolerance": None if tolerance is None else _bounded(tolerance),
+            "timeout": _bounded(timeout),
+        }
         settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=self._received)
         self._mirror.know(settled)
         return settled
@@ -160,10 +169,24 @@ class RemoteRig(Listening):
         progress: Callable[[int, int, Found | None], None] | None = None,
     ) -> list[Found]:
         params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
-        if progress is not None:
-            self._scanning[bus] = progress
+        call = asyncio.ensure_future(self._session.call("scan", params))
+        failed: list[Exception] = []
+
+        def report(asked: int, count: int, found: Found | None) -> None:
+            try:
+                if progress is not None and not failed:
+                    progress(asked, count, found)
+            except Exception as error:  # noqa: BLE001 - the caller's own, and raised there
+                failed.append(error)
+                call.cancel()
+
+        self._scanning[bus] = report
         try:
-            found: list[Found] = await self._session.call("scan", params)
+            found: list[Found] = await call
+        except asyncio.CancelledError:
+            if failed:
+                raise failed[0] from None
+            raise
         finally:
             self._scanning.pop(bus, None)
         return found
@@ -185,5 +208,5 @@ class RemoteRig(Listening):
 
 
 def _bounded(seconds: float) -> float:
-    """Infinity is no JSON."""
-    return min(seconds, FOREVER)
+    """JSON has no infinity."""
+    return seconds if seconds < FOREVER else FOREVER

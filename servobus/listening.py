@@ -22,6 +22,9 @@ from servobus.rpc.methods import LEAST_HZ, MOST_HZ, Greeting
 from servobus.session import DEADLINE, Dial, Session
 from servobus.wire import Wire
 
+REFRESH_TIMEOUT = 1.0
+"""Seconds a verb that is done waits for what it has changed."""
+
 
 class Listening(Rig):
     """A rig that the other end tells about."""
@@ -122,7 +125,7 @@ class Listening(Rig):
     async def _refresh(self) -> None:
         """After a verb that has changed what all may see."""
         with suppress(ServobusError):  # the verb itself was done
-            self._mirror.know(await self._session.call("snapshot", {}, then=self._received))
+            self._mirror.know(await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._received))
 
     async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
         """Snapshots as the daemon sends them, at most 200 a second; a slow reader gets fewer, never old ones. When the

@@ -116,7 +116,7 @@ class Wire(asyncio.Protocol):
                 raise ValueError(f"an answer to request {message.id}, which was never made")
             elif message.id in self._calls:  # else it was given up, or is answered already
                 self._answered(message.id, message)
-        except (ValueError, msgspec.MsgspecError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:  # msgspec's own are ValueErrors
             self._nonsense(line, str(error))
 
     def _rejected(self, error: Any) -> None:
@@ -156,7 +156,8 @@ class Wire(asyncio.Protocol):
     def _ask(self, method: str, params: dict[str, Any], timeout: float, then: Callable[[Any], Any] | None) -> int:
         if self.down is not None:
             raise LinkDown(f"{self.down.message}; nothing was sent")
-        if len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT:
+        full = len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT
+        if full and method != "stop":
             raise Overloaded(f"{len(self._calls)} calls wait for the daemon already: ask for less, or later")
         line = self._encoded({"jsonrpc": "2.0", "id": self._asked + 1, "method": method, "params": params})
         self._asked += 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +26,14 @@ from servobus.errors import (
     UnknownName,
 )
 from servobus.events import Event
+from servobus.opening import open_rig
 from servobus.protocols.words import Goal, Outcome
 from servobus.rpc.methods import MAX_LINE
 from servobus.session import SILENCE
 from servobus.wire import MAX_ANSWER, MAX_WAITING
+from tests.plain_door import open_plain_door
 from tests.puppet_daemon import GREETING, STATE, PuppetDaemon, Visitor, failed, puppet_daemon
+from tests.rigs import config
 from tests.virtual import virtual
 
 LEASE = 0.3
@@ -127,6 +132,7 @@ async def test_another_protocol(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "babble",
     [
+        b'{"jsonrpc":"2.0","method":"progress","params":{"bus":[]}}\n',
         b"HTTP/1.1 400 Bad Request\r\n\r\n",
         b"\n",
         b"[]\n",
@@ -245,6 +251,8 @@ async def test_a_call_that_is_too_much(tmp_path: Path) -> None:
         await asyncio.sleep(0.1)
         with pytest.raises(Overloaded, match="wait for the daemon"):
             await rig.ping("s1")
+        daemon.answers["stop"] = {"result": {}}
+        assert await rig.stop() == {}  # whatever waits
         for task in waiting:
             task.cancel()
         await asyncio.gather(*waiting, return_exceptions=True)
@@ -372,6 +380,33 @@ async def test_names_follow_a_reload_by_somebody_else(tmp_path: Path) -> None:
         assert list(rig.snapshot()) == ["arm/s1", "arm/s9"]
 
 
+@pytest.mark.parametrize(
+    ("method", "told"),
+    [
+        ("state", {}),
+        ("state", {"stopped": False, "states": 1}),
+        ("state", {"stopped": False, "states": {"arm/s1": {"position": "1"}}}),
+        ("stats", {}),
+        ("event", {"name": 3}),
+        ("event", {}),
+        ("progress", {}),
+    ],
+)
+@virtual
+async def test_a_notice_that_is_none_ends_the_connection(tmp_path: Path, method: str, told: dict[str, Any]) -> None:
+    async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
+        events: list[Event] = []
+        listening = asyncio.create_task(listen(rig, events))
+        await asyncio.sleep(0.1)
+        for number in range(5):
+            daemon.visitor.say({"method": method, "params": told | {"subscription": number}})
+        await until(lambda: len(daemon.visitors) == 2)
+        await asyncio.sleep(0.1)
+        listening.cancel()
+        assert [event.name for event in events] == ["daemon_lost", "daemon_back"]
+        assert "another version" in str(events[0].fields["reason"])
+
+
 # Leases
 
 
@@ -458,3 +493,58 @@ async def test_leaving_while_it_is_lost(tmp_path: Path) -> None:
         count = len(daemon.visitors)
         await asyncio.sleep(5)
         assert len(daemon.visitors) == count
+
+
+@pytest.mark.parametrize("way", ["release", "normal", "error", "killed"])
+@virtual
+async def test_what_becomes_of_motion_when_its_client_leaves(tmp_path: Path, way: str) -> None:
+    async with open_rig(config("s1: {id: 1, model: sts, speed: 20, on_lost_client: hold}")) as home:
+        async with open_plain_door(home, tmp_path / "s") as door:
+            try:
+                async with connect(tmp_path / "s") as rig:
+                    await rig.enable()
+                    await rig["s1"].move_to(40)
+                    await asyncio.sleep(1)
+                    if way == "release":
+                        await rig.release()
+                        await asyncio.sleep(3)
+                    if way == "error":
+                        raise ZeroDivisionError
+                    if way == "killed":
+                        next(iter(door.guests)).transport.abort()
+                        await asyncio.sleep(3)
+            except ZeroDivisionError:
+                pass
+            await asyncio.sleep(3)
+            finished = (await home.read("s1")).position == pytest.approx(40, abs=1)
+            assert finished is (way in ("release", "normal"))
+
+
+@virtual
+async def test_two_clients_and_one_servo(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    async with open_rig(config()) as home, open_plain_door(home, path), connect(path) as first, connect(path) as second:
+        await first.enable()
+        await first["s1"].move_to(5)
+        await asyncio.sleep(5)
+        for _ in range(2):
+            with pytest.raises(LeaseHeld, match="arm/s1"):
+                await second["s1"].move_to(6)
+        assert await second["s2"].move_to(6) is Outcome.ACKED
+        await second.stop()  # anyone may
+        await until(lambda: first.stopped)
+        await first.clear()
+        await first.release("s1")
+        assert await second["s1"].move_to(6) is Outcome.ACKED
+
+
+def test_a_client_loads_no_engine() -> None:
+    code = """
+import sys, servobus.client, servobus.blocking
+servobus.connect, servobus.Rig, servobus.LinkDown
+print([name for name in sys.modules if name.startswith(("serial", "pydantic", "ruamel", "servobus.bus", "servobus.sim", "servobus.links"))])
+import servobus
+assert servobus.open.__name__ == "open_rig" and "open" in dir(servobus)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "[]\n"

@@ -407,9 +407,16 @@ async def test_scanning(over: Over, tmp_path: Path) -> None:
         assert len(await rig.scan("arm")) == 3
         with pytest.raises(UnknownName, match="arm"):
             await rig.scan("leg")
+        with pytest.raises(ZeroDivisionError):
+            await rig.scan("arm", ids=[1, 2], progress=fail)
+        await asyncio.sleep(1)
         await rig.enable("s1")
         with pytest.raises(LeaseHeld, match="s1"):
             await rig.scan("arm", ids=[1])
+
+
+def fail(*_: object) -> None:
+    raise ZeroDivisionError
 
 
 @both
