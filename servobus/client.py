@@ -168,6 +168,7 @@ class RemoteRig(Listening):
         ids: Iterable[int] = (),
         progress: Callable[[int, int, Found | None], None] | None = None,
     ) -> list[Found]:
+        """As `Rig.scan`; one that its caller leaves goes on to its end at the daemon."""
         params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
         call = asyncio.ensure_future(self._session.call("scan", params))
         failed: list[Exception] = []
