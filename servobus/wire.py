@@ -147,24 +147,26 @@ class Wire(asyncio.Protocol):
 
     async def call(self, method: str, params: dict[str, Any], *, timeout: float, then: Callable[[Any], Any] | None = None) -> Any:
         """What the daemon answers. Raises what it says, LinkDown, and ReplyTimeout when it says nothing for `timeout` seconds."""
-        number = self._ask(method, params, timeout, then)
+        number, answer = self._ask(method, params, timeout, then)
         try:
-            return await self._calls[number].answer
+            return await answer
         finally:
             self._forget(number)
 
-    def _ask(self, method: str, params: dict[str, Any], timeout: float, then: Callable[[Any], Any] | None) -> int:
+    def _ask(
+        self, method: str, params: dict[str, Any], timeout: float, then: Callable[[Any], Any] | None
+    ) -> tuple[int, asyncio.Future[Any]]:
         if self.down is not None:
             raise LinkDown(f"{self.down.message}; nothing was sent")
         full = len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT
         if full and method != "stop":
             raise Overloaded(f"{len(self._calls)} calls wait for the daemon already: ask for less, or later")
         line = self._encoded({"jsonrpc": "2.0", "id": self._asked + 1, "method": method, "params": params})
-        self._asked += 1
-        overdue = self._loop.call_later(timeout, self._overdue, self._asked)
-        self._calls[self._asked] = _Call(method, self._loop.create_future(), timeout, overdue, then)
+        self._asked = number = self._asked + 1
+        answer = self._loop.create_future()
+        self._calls[number] = _Call(method, answer, timeout, self._loop.call_later(timeout, self._overdue, number), then)
         self._transport.write(line)
-        return self._asked
+        return number, answer
 
     def tell(self, method: str, params: dict[str, Any]) -> None:
         """Without an answer."""
