@@ -17,7 +17,6 @@ from typing import Any
 from servobus.dial import address_of, token_of
 from servobus.errors import LimitError, ServobusError
 from servobus.listening import Listening
-from servobus.mirror import received
 from servobus.protocols.words import GOAL_NUMBERS, Change, Goal, Identity, Outcome, State, StopReport, is_number, no_number
 from servobus.rig import Found, Reload, Snapshot
 from servobus.rpc.methods import LEAST_HZ, MOST_HZ
@@ -126,8 +125,7 @@ class RemoteRig(Listening):
             "tolerance": None if tolerance is None else _bounded(tolerance),
             "timeout": _bounded(timeout),
         }
-        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=self._received)
-        self._mirror.know(settled)
+        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=self._learnt)
         return settled
 
     # One servo
@@ -135,8 +133,7 @@ class RemoteRig(Listening):
     async def read(self, name: str, *, max_age: float | None = None) -> State:
         full = self.full_name(name)
         params = {"name": full, "max_age": None if max_age is None else _bounded(max_age)}
-        state: State = await self._session.call("read", params, then=lambda state: received(state, self._clock()))
-        self._mirror.know({full: state})
+        state: State = await self._session.call("read", params, then=lambda state: self._learnt({full: state})[full])
         return state
 
     async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:

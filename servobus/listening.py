@@ -22,6 +22,8 @@ from servobus.rpc.methods import LEAST_HZ, MOST_HZ, Greeting
 from servobus.session import DEADLINE, Dial, Session
 from servobus.wire import Wire
 
+SHORTEST_LEASE = 0.1
+"""Seconds; no daemon makes us renew more often than that asks for."""
 REFRESH_TIMEOUT = 1.0
 """Seconds a verb that is done waits for what it has changed."""
 
@@ -32,7 +34,7 @@ class Listening(Rig):
     def __init__(self, place: str, dial: Dial, hello: Callable[[], dict[str, Any]], refresh_hz: float) -> None:
         self._mirror = Mirror()
         self._announcer = Announcer()
-        self._session = Session(place, dial, hello, self._know, self._changed, self._progressed)
+        self._session = Session(place, dial, hello, self._greeted, self._know, self._changed, self._progressed)
         self._holding = Holding(self._session)
         self._refresh_hz = refresh_hz
         self._clock = asyncio.get_running_loop().time
@@ -51,27 +53,27 @@ class Listening(Rig):
         self._session.want({"topic": "stats", "hz": 1.0}, lambda told: self._mirror.counted(told["stats"]))
         await self._session.connect()
 
-    async def _know(self, wire: Wire, greeting: Greeting) -> None:
-        """A connection is there: what `names`, `stopped`, `snapshot` and `stats` have to say."""
-        states, stats = await asyncio.gather(
-            wire.call("snapshot", {}, timeout=DEADLINE, then=self._received), wire.call("stats", {}, timeout=DEADLINE)
-        )
+    def _greeted(self, greeting: Greeting) -> None:
         self.greeting = greeting
-        self._holding.begin(greeting.lease_ms / 1000)
-        mirror = self._mirror
-        mirror.names, mirror.stopped, mirror.down = greeting.names, greeting.stopped, None
-        mirror.know(states)
-        mirror.counted(stats)
+        self._holding.begin(max(greeting.lease_ms / 1000, SHORTEST_LEASE))
+        self._mirror.names, self._mirror.stopped = greeting.names, greeting.stopped
+
+    async def _know(self, wire: Wire) -> None:
+        """A connection is there: what `snapshot` and `stats` have to say."""
+        await asyncio.gather(
+            wire.call("snapshot", {}, timeout=DEADLINE, then=self._learnt),
+            wire.call("stats", {}, timeout=DEADLINE, then=self._mirror.counted),
+        )
 
     def _changed(self, lost: LinkDown | None) -> None:
-        """The connection was lost, or is back."""
+        """The connection is there, or no more."""
+        was, self._mirror.down = self._mirror.down, lost
         if lost is not None:
-            self._mirror.down = lost
             for newest in self._watching:
                 newest.put(self._mirror.snapshot(self._clock()))
-        self._announcer.tell(
-            Event("daemon_back", self._clock()) if lost is None else Event("daemon_lost", self._clock(), {"reason": lost.message})
-        )
+            self._announcer.tell(Event("daemon_lost", self._clock(), {"reason": lost.message}))
+        elif was is not None:
+            self._announcer.tell(Event("daemon_back", self._clock()))
 
     async def leave(self, *, lost: bool) -> None:
         """Give back what is held, unless `lost`; then hang up."""
@@ -105,15 +107,17 @@ class Listening(Rig):
         """About a second old at most. Raises LinkDown while there is no connection."""
         return self._mirror.stats()
 
-    def _received(self, states: Snapshot) -> Snapshot:
+    def _learnt(self, states: Snapshot) -> Snapshot:
+        """At the moment they come, so that nothing newer is replaced."""
         now = self._clock()
-        return {name: received(state, now) for name, state in states.items()}
+        states = {name: received(state, now) for name, state in states.items()}
+        self._mirror.know(states)
+        return states
 
     def _seen(self, told: dict[str, Any]) -> Snapshot:
         """A state notice."""
-        states = self._received(msgspec.convert(told["states"], Snapshot))
+        states = self._learnt(msgspec.convert(told["states"], Snapshot))
         self._mirror.stopped = bool(told["stopped"])
-        self._mirror.know(states)
         if states.keys() != self._mirror.names.keys() and (self._renaming is None or self._renaming.done()):
             self._renaming = asyncio.create_task(self._rename())  # the config was read anew
         return states
@@ -125,7 +129,7 @@ class Listening(Rig):
     async def _refresh(self) -> None:
         """After a verb that has changed what all may see."""
         with suppress(ServobusError):  # the verb itself was done
-            self._mirror.know(await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._received))
+            await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._learnt)
 
     async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
         """Snapshots as the daemon sends them, at most 200 a second; a slow reader gets fewer, never old ones. When the
@@ -161,7 +165,7 @@ class Listening(Rig):
             unlisten()
 
     def _happened(self, told: dict[str, Any]) -> None:
-        self._announcer.tell(Event(told["name"], self._clock(), told.get("fields", {}), told.get("missed", 0)))
+        self._announcer.tell(Event(str(told["name"]), self._clock(), dict(told.get("fields", {})), int(told.get("missed", 0))))
 
     def _progressed(self, told: dict[str, Any]) -> None:
         progress = self._scanning.get(told["bus"])

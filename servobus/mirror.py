@@ -52,7 +52,7 @@ class Mirror:
     def stats(self) -> dict[str, Any]:
         """Raises LinkDown: figures do not tell their age."""
         if self.down is not None:
-            raise self.down
+            raise LinkDown(self.down.message)
         return self._stats
 
 

@@ -37,21 +37,23 @@ class Subscription:
 
 
 class Session:
-    """`hello()` gives what to greet with; `up(wire, greeting)` asks what has to be known before the connection is used;
-    `changed(reason)` hears of the loss and of the return (None)."""
+    """`hello()` gives what to greet with; `greeted` is told what the daemon says to that, and `up(wire)` asks what else has to be
+    known before the connection is used. `changed(reason)` hears that it is there (None), or why no more."""
 
     def __init__(
         self,
         place: str,
         dial: Dial,
         hello: Callable[[], dict[str, Any]],
-        up: Callable[[Wire, Greeting], Awaitable[None]],
+        greeted: Callable[[Greeting], None],
+        up: Callable[[Wire], Awaitable[None]],
         changed: Callable[[LinkDown | None], None],
         progress: Callable[[dict[str, Any]], None],
     ) -> None:
         self.place = place
         self._dial = dial
         self._hello = hello
+        self._greeted = greeted
         self._up = up
         self._changed = changed
         self._progress = progress
@@ -68,16 +70,17 @@ class Session:
         hello = self._hello()
         wire = await self._dial(lambda: Wire(self.place, self._notice, self._lost))
         try:
-            greeting = await self._greet(wire, hello)
+            self._greeted(await self._greet(wire, hello))
             for subscription in tuple(self._subscriptions):
                 await self._begin(wire, subscription)
-            await self._up(wire, greeting)
+            await self._up(wire)
             if wire.down is not None:
-                raise wire.down
+                raise LinkDown(wire.down.message)
         except BaseException:
             wire.fail("the greeting was not finished")
             raise
         self._wire = wire
+        self._changed(None)
         self._watch()
 
     async def _greet(self, wire: Wire, hello: dict[str, Any]) -> Greeting:
@@ -117,14 +120,21 @@ class Session:
 
     async def subscribe(self, params: dict[str, Any], sink: Callable[[dict[str, Any]], object]) -> Subscription:
         """From now on, and again with every new connection."""
-        subscription = Subscription(params, sink)
+        wire, subscription = self._present(), Subscription(params, sink)
         self._subscriptions[subscription] = None
+        begun = asyncio.ensure_future(self._begin(wire, subscription))
         try:
-            await self._begin(self._present(), subscription)
+            await asyncio.shield(begun)
         except BaseException:
-            self.unsubscribe(subscription)
+            self._subscriptions.pop(subscription, None)
+            begun.add_done_callback(lambda _: self._abandoned(begun, subscription))
             raise
         return subscription
+
+    def _abandoned(self, begun: asyncio.Future[None], subscription: Subscription) -> None:
+        """A caller that left meanwhile leaves nothing behind at the daemon."""
+        if not begun.cancelled() and begun.exception() is None:
+            self.unsubscribe(subscription)
 
     @staticmethod
     async def _begin(wire: Wire, subscription: Subscription) -> None:
@@ -164,12 +174,10 @@ class Session:
             await asyncio.sleep(delay)
             try:
                 await self.connect()
-            except ServobusError as error:
-                self._down = error if isinstance(error, LinkDown) else LinkDown(error.message)
-                delay = min(2 * delay, MOST_DELAY)
-            else:
-                self._changed(None)
                 return
+            except Exception as error:  # noqa: BLE001 - whatever is wrong with this daemon, the next one may be right
+                self._down = LinkDown(error.message if isinstance(error, ServobusError) else f"{self.place}: {error}")
+            delay = min(2 * delay, MOST_DELAY)
 
     def _watch(self) -> None:
         """A daemon that has nothing to say any more is lost, whatever the network says."""

@@ -371,6 +371,17 @@ async def test_watching_goes_on(tmp_path: Path) -> None:
 
 
 @virtual
+async def test_a_watcher_that_leaves_at_once_leaves_no_subscription(tmp_path: Path) -> None:
+    async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
+        watching = [asyncio.ensure_future(anext(aiter(rig.watch()))) for _ in range(5)]
+        await asyncio.sleep(0)
+        for task in watching:
+            task.cancel()
+        await until(lambda: len(daemon.calls("unsubscribe")) == 5)
+        assert len({params["subscription"] for params in daemon.calls("unsubscribe")}) == 5
+
+
+@virtual
 async def test_names_follow_a_reload_by_somebody_else(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         daemon.answers["names"] = {"result": {"arm/s1": ["arm", "s1"], "arm/s9": ["arm", "s9"]}}
