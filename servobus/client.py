@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from servobus.dial import address_of, token_of
 from servobus.errors import LimitError, ServobusError
@@ -22,6 +22,7 @@ from servobus.rig import Found, Reload, Snapshot
 from servobus.rpc.methods import LEAST_HZ, MOST_HZ
 from servobus.session import DEADLINE
 
+T = TypeVar("T")
 FOREVER = 1e9
 
 
@@ -67,7 +68,7 @@ class RemoteRig(Listening):
         if not full:
             return {}
         params = {"goals": {name: asdict(goal) for name, goal in full.items()}, "together": together, "confirm": confirm}
-        outcomes: dict[str, Outcome] = await self._holding.move("send_all", full, params)
+        outcomes: dict[str, Outcome] = await self._holding.move("send_all", full, params, lambda told: _about(full, told))
         return outcomes
 
     def _checked(self, name: str, goal: Goal) -> Goal:
@@ -120,12 +121,13 @@ class RemoteRig(Listening):
         return result
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
-        params = {
-            "names": self.full_names(names),
-            "tolerance": None if tolerance is None else _bounded(tolerance),
-            "timeout": _bounded(timeout),
-        }
-        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=self._learnt)
+        full, near = self.full_names(names), None if tolerance is None else _bounded(tolerance)
+        params = {"names": full, "tolerance": near, "timeout": _bounded(timeout)}
+
+        def learnt(states: Snapshot) -> Snapshot:
+            return self._learnt(_about(full, states))
+
+        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=learnt)
         return settled
 
     # One servo
@@ -203,6 +205,13 @@ class RemoteRig(Listening):
         await self._rename()
         await self._refresh()
         return report
+
+
+def _about(names: Collection[str], told: dict[str, T]) -> dict[str, T]:
+    """An answer about other servos is none."""
+    if told.keys() != set(names):
+        raise ValueError(f"an answer about {', '.join(told) or 'nothing'}, not about {', '.join(names)}")
+    return told
 
 
 def _bounded(seconds: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any
 
@@ -31,7 +31,9 @@ class Holding:
         self._claims.clear()
         self._claims.ttl = ttl
 
-    async def move(self, method: str, servos: Collection[str], params: dict[str, Any]) -> Any:
+    async def move(
+        self, method: str, servos: Collection[str], params: dict[str, Any], then: Callable[[Any], Any] | None = None
+    ) -> Any:
         """A wish of this moment: what was lost since the last one is acquired for it in so many words."""
         if anew := self._claims.to_acquire(servos, self._clock()):
             await self.acquire(anew)
@@ -39,7 +41,7 @@ class Holding:
         self._moving += 1
         asked = self._clock()
         try:
-            result = await self._session.call(method, params)
+            result = await self._session.call(method, params, then=then)
         except LeaseHeld:
             self._claims.refused(servos)
             raise

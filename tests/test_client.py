@@ -199,6 +199,19 @@ async def test_answers_that_come_late_twice_or_in_another_order(tmp_path: Path) 
 
 
 @virtual
+async def test_an_answer_about_another_servo_is_none(tmp_path: Path) -> None:
+    async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
+        daemon.answers["send_all"] = {"result": {"arm/s2": "acked"}}
+        with pytest.raises(LinkDown, match=r"about arm/s2, not about arm/s1.*may have been applied"):
+            await rig["s1"].move_to(5)
+        await until(lambda: len(daemon.visitors) == 2)
+        await asyncio.sleep(0.1)
+        daemon.answers["settle"] = {"result": {"arm/s1": STATE, "arm/s2": STATE}}
+        with pytest.raises(LinkDown, match="about arm/s1, arm/s2"):
+            await rig["s1"].settle()
+
+
+@virtual
 async def test_a_daemon_that_hangs_costs_a_call_its_deadline_and_no_more(tmp_path: Path) -> None:
     asked: list[int] = []
 
