@@ -128,7 +128,7 @@ class Scan(Params):
     baudrates: tuple[int, ...] = ()
     ids: tuple[int, ...] = ()
     progress: bool = False
-    """Notifications `progress` while it lasts."""
+    """Notices `progress` {bus, asked, count, found} while it lasts."""
 
 
 class SetId(Params):
@@ -146,7 +146,10 @@ class SetBaudrate(Params):
 
 
 class Subscribe(Params):
-    """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`."""
+    """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`.
+
+    Notices: `state` {subscription, stopped, missed, states}, `event` {subscription, name, time, fields, missed}, `stats`
+    {subscription, missed, stats}."""
 
     topic: str
     hz: float = 10.0
