@@ -1,6 +1,11 @@
-"""servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos."""
+"""servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos.
 
-from servobus.client import RemoteRig, connect
+`open`, `connect` and `blocking` are loaded when they are first used: a client of a daemon needs no engine.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from servobus.errors import (
     AccessDenied,
     ActionWithheld,
@@ -24,9 +29,14 @@ from servobus.errors import (
     UnknownName,
 )
 from servobus.events import Event
-from servobus.opening import open_rig as open
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Reload, Rig, Servo, Snapshot
+
+if TYPE_CHECKING:
+    from servobus import blocking
+    from servobus.client import RemoteRig, connect
+    from servobus.local import LocalRig
+    from servobus.opening import open_rig as open
 
 __all__ = [
     "AccessDenied",
@@ -44,6 +54,7 @@ __all__ = [
     "LeaseHeld",
     "LimitError",
     "LinkDown",
+    "LocalRig",
     "NotEnabled",
     "NotSupported",
     "Outcome",
@@ -62,6 +73,28 @@ __all__ = [
     "State",
     "StopReport",
     "UnknownName",
+    "blocking",
     "connect",
     "open",
 ]
+
+_LATER = {
+    "LocalRig": ("servobus.local", "LocalRig"),
+    "RemoteRig": ("servobus.client", "RemoteRig"),
+    "blocking": ("servobus.blocking", None),
+    "connect": ("servobus.client", "connect"),
+    "open": ("servobus.opening", "open_rig"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _LATER[name]
+    value = import_module(module) if attribute is None else getattr(import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER})

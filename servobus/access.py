@@ -11,30 +11,16 @@ import ipaddress
 import os
 import pwd
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Annotated, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from servobus.protocols.model import Data
+from servobus.roles import Role
+
+__all__ = ["AccessOptions", "DoorOptions", "Role", "TcpOptions", "TlsOptions"]
 
 PATTERN = r"^@?[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?$"
-
-
-class Role(IntEnum):
-    """In the order of what they may."""
-
-    NOBODY = 0
-    """Has not shown a token yet."""
-    OBSERVER = 1
-    """Reads, and stops: anyone may stop."""
-    OPERATOR = 2
-    """Moves."""
-    ADMIN = 3
-    """Changes what stays: ids, rates, EEPROM, the config."""
-
-    def __str__(self) -> str:
-        return self.name.lower()
 
 
 Who = Annotated[str, Field(pattern=PATTERN)]

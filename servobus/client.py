@@ -1,150 +1,163 @@
-"""RemoteRig: the rig of a running daemon, by its native door. A program cannot tell it from one of its own.
+"""RemoteRig: the rig of a running daemon. A program cannot tell it from one whose ports it owns itself.
 
-It connects again by itself when the daemon was away. What was under way then fails and is never repeated; while it is away calls
-fail at once. A lease is renewed as long as this process runs, and given back when the context is left in order.
+Motion needs its servos' leases, which it takes and keeps by itself (`holding.py`). After a verb that enables, disables or stops,
+`snapshot` and `stopped` are as that verb has left them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import ssl
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import msgspec
+from servobus.dial import address_of, token_of
+from servobus.errors import LimitError, ServobusError
+from servobus.listening import Listening
+from servobus.protocols.words import GOAL_NUMBERS, Change, Goal, Identity, Outcome, State, StopReport, is_number, no_number
+from servobus.rig import Found, Reload, Snapshot
+from servobus.rpc.methods import LEAST_HZ, MOST_HZ
+from servobus.session import DEADLINE
 
-from servobus.errors import LeaseHeld, LimitError, LinkDown
-from servobus.events import Event
-from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport, is_number
-from servobus.rig import Found, Reload, Rig, Snapshot
-from servobus.rpc.methods import Greeting
-from servobus.rpc.place import find_socket, socket_path
-from servobus.rpc.wire import Wire, open_wire
-from servobus.session import PATIENCE, Session
-
-REFRESH_HZ = 10.0
-"""How often what `snapshot` answers is renewed."""
-SCAN_PATIENCE = 3600.0
+T = TypeVar("T")
+FOREVER = 1e9
 
 
-class RemoteRig(Rig):
-    """Made by `servobus.connect`, and alive as long as that context."""
+@asynccontextmanager
+async def connect(
+    place: str | Path | None = None,
+    *,
+    name: str = "",
+    token: str | None = None,
+    token_file: str | Path | None = None,
+    tls: bool | str | Path | ssl.SSLContext = False,
+    refresh_hz: float = 10.0,
+) -> AsyncIterator[RemoteRig]:
+    """The rig of the daemon at `place`: the path of its socket (none: the usual one), or tcp://host:port with its token. `name`:
+    what others read when this client holds a servo. `tls`: True, the PEM file that signs the daemon's certificate, or a context.
+    Left normally, motion goes on to its end; left by an exception, the servos moved from here do their `on_lost_client`.
+    Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
+    if not LEAST_HZ <= refresh_hz <= MOST_HZ:
+        raise ValueError(f"connect: refresh_hz {refresh_hz} is outside {LEAST_HZ:g} to {MOST_HZ:g}")
+    address = address_of(place, tls)
+    rig = RemoteRig(str(address), address.dial, lambda: {"client": name, "token": token_of(token, token_file)}, refresh_hz)
+    try:
+        await rig.start()
+        yield rig
+    except BaseException:
+        await rig.leave(lost=True)
+        raise
+    await rig.leave(lost=False)
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
 
-    @property
-    def greeting(self) -> Greeting:
-        """What the daemon said of itself when it was last connected."""
-        return self._session.greeting
+class RemoteRig(Listening):
+    """Made by `servobus.connect`, and alive as long as that context. It connects anew by itself; a call while there is no
+    connection raises LinkDown at once, and none is ever repeated."""
 
-    @property
-    def names(self) -> Mapping[str, tuple[str, str]]:
-        return self._session.greeting.names
+    # Motion
 
     async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
         full: dict[str, Goal] = {}
         for name, goal in goals.items():
-            if self.full_name(name) in full:
-                raise LimitError(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
-            _refuse(goal)
-            full[self.full_name(name)] = goal
+            if (whole := self.full_name(name)) in full:
+                raise LimitError(f"{whole} is named twice: give it one goal; nothing was sent")
+            full[whole] = self._checked(whole, goal)
         if not full:
             return {}
-        if again := self._session.lost & full.keys():  # this is a wish of now: it may be taken again
-            await self.acquire(*again)
-        try:
-            result: dict[str, Outcome] = await self._session.call("send_all", goals=full, together=together, confirm=confirm)
-        except LeaseHeld:
-            self._session.lost |= full.keys()  # if it had expired, the next wish asks for it anew
-            raise
-        finally:
-            if self._session.wire is not None:
-                self._session.held |= full.keys() - self._session.lost
-        return result
+        params = {"goals": {name: asdict(goal) for name, goal in full.items()}, "together": together, "confirm": confirm}
+        outcomes: dict[str, Outcome] = await self._holding.move("send_all", full, params, lambda told: _about(full, told))
+        return outcomes
+
+    def _checked(self, name: str, goal: Goal) -> Goal:
+        """JSON has no word for what is no number, so that is refused here."""
+        numbers: dict[str, Any] = {}
+        for field in GOAL_NUMBERS:
+            value = getattr(goal, field)
+            if value is None and field != "value":
+                continue
+            if not is_number(value):
+                bus, servo = self.names[name]
+                raise LimitError(no_number(field, value), bus=bus, servo=servo)
+            numbers[field] = float(value)
+        return replace(goal, **numbers)
+
+    async def acquire(self, *names: str) -> None:
+        await self._holding.acquire(self.full_names(names))
+
+    async def release(self, *names: str) -> None:
+        await self._holding.release(self.full_names(names))
 
     async def enable(self, *names: str) -> None:
-        await self._session.call("enable", names=self.full_names(names))
+        await self._do("enable", {"names": self.full_names(names)})
 
     async def disable(self, *names: str) -> None:
-        await self._session.call("disable", names=self.full_names(names))
+        await self._do("disable", {"names": self.full_names(names)})
 
     async def stop(self) -> dict[str, StopReport]:
-        reports: dict[str, StopReport] = await self._session.call("stop")
-        self._session.stopped = True
+        def latched(reports: dict[str, StopReport]) -> dict[str, StopReport]:
+            self._mirror.stopped = True
+            return reports
+
+        reports: dict[str, StopReport] = await self._do("stop", {}, then=latched)
         return reports
 
     async def clear(self) -> None:
-        await self._session.call("clear")
-        self._session.stopped = False
+        def released(_: None) -> None:
+            self._mirror.stopped = False
 
-    @property
-    def stopped(self) -> bool:
-        """As of the last news, which are at most a refresh old."""
-        return self._session.stopped
+        await self._do("clear", {}, then=released)
+
+    async def _do(self, method: str, params: dict[str, Any], then: Callable[[Any], Any] | None = None) -> Any:
+        """A verb after which `snapshot` is to be as it has left the servos, even when it failed for some."""
+        try:
+            result = await self._session.call(method, params, then=then)
+        except ServobusError:
+            await self._refresh()
+            raise
+        await self._refresh()
+        return result
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
-        found: Snapshot = await self._session.call(
-            "settle", PATIENCE + timeout, names=self.full_names(names), tolerance=tolerance, timeout=timeout
-        )
-        return found
+        full, near = self.full_names(names), None if tolerance is None else _bounded(tolerance)
+        params = {"names": full, "tolerance": near, "timeout": _bounded(timeout)}
+
+        def learnt(states: Snapshot) -> Snapshot:
+            return self._learnt(_about(full, states))
+
+        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=learnt)
+        return settled
+
+    # One servo
 
     async def read(self, name: str, *, max_age: float | None = None) -> State:
-        state: State = await self._session.call("read", name=self.full_name(name), max_age=max_age)
+        full = self.full_name(name)
+        params = {"name": full, "max_age": None if max_age is None else _bounded(max_age)}
+        state: State = await self._session.call("read", params, then=lambda state: self._learnt({full: state})[full])
         return state
 
-    def snapshot(self) -> Snapshot:
-        """As of the last refresh."""
-        return dict(self._session.known)
-
-    async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
-        if not 0 < hz <= 1000:
-            raise ValueError(f"watch: {hz} Hz is outside 0 to 1000")
-        yield self.snapshot()
-        news: asyncio.Queue[Snapshot] = asyncio.Queue(1)
-
-        def put(params: Any) -> None:
-            if news.full():
-                news.get_nowait()  # the latest wins
-            news.put_nowait(msgspec.convert(params["states"], Snapshot))
-
-        wire, number = None, 0
-        try:
-            while True:
-                if wire is not self._session.wire and self._session.wire is not None:  # the first time, and after it was away
-                    wire = self._session.wire
-                    with suppress(LinkDown):
-                        number = await self._session.ask("subscribe", {"topic": "state", "hz": min(max(hz, 0.1), 200.0)}, int)
-                        self._session.watchers[number] = put
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(1.0):
-                        yield await news.get()
-        finally:
-            self._session.watchers.pop(number, None)
-            if wire is not None and wire is self._session.wire:
-                wire.tell("unsubscribe", {"subscription": number})
-
-    def events(self) -> AsyncIterator[Event]:
-        return self._session.announcer.events()
-
     async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:
-        return await self._session.call("read_register", name=self.full_name(name), register=register, raw=raw)
+        return await self._session.call("read_register", {"name": self.full_name(name), "register": register, "raw": raw})
 
     async def write_register(self, name: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
-        if isinstance(value, float) and not is_number(value):
-            raise LimitError(f"{value} is no finite number: nothing was sent")
         full = self.full_name(name)
-        return await self._session.call("write_register", name=full, register=register, value=value, raw=raw, persist=persist)
+        if not is_number(value):
+            bus, servo = self.names[full]
+            raise LimitError(no_number(f"register {register}", value), bus=bus, servo=servo)
+        params = {"name": full, "register": register, "value": value, "raw": raw, "persist": persist}
+        return await self._session.call("write_register", params)
 
     async def ping(self, name: str) -> int | None:
-        status: int | None = await self._session.call("ping", name=self.full_name(name))
-        return status
+        health: int | None = await self._session.call("ping", {"name": self.full_name(name)})
+        return health
 
     async def identify(self, name: str) -> Identity:
-        identity: Identity = await self._session.call("identify", name=self.full_name(name))
+        identity: Identity = await self._session.call("identify", {"name": self.full_name(name)})
         return identity
+
+    # A bus, and all
 
     async def scan(
         self,
@@ -154,92 +167,57 @@ class RemoteRig(Rig):
         ids: Iterable[int] = (),
         progress: Callable[[int, int, Found | None], None] | None = None,
     ) -> list[Found]:
-        if progress is not None:
-            self._session.progress[bus] = progress
+        """As `Rig.scan`; one that its caller leaves goes on to its end at the daemon."""
+        params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
+        call = asyncio.ensure_future(self._session.call("scan", params))
+        failed: list[Exception] = []
+
+        def report(asked: int, count: int, found: Found | None) -> None:
+            try:
+                if progress is not None and not failed:
+                    progress(asked, count, found)
+            except Exception as error:  # noqa: BLE001 - the caller's own, and raised there
+                failed.append(error)
+                call.cancel()
+
+        self._scanning[bus] = report
         try:
-            keys = {"baudrates": list(baudrates), "ids": list(ids), "progress": progress is not None}
-            found: list[Found] = await self._session.call("scan", SCAN_PATIENCE, bus=bus, **keys)
-            return found
+            found: list[Found] = await call
+        except asyncio.CancelledError:
+            if failed:
+                raise failed[0] from None
+            raise
         finally:
-            self._session.progress.pop(bus, None)
+            self._scanning.pop(bus, None)
+        return found
 
     async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
-        change: Change = await self._session.call("set_id", 3 * PATIENCE, bus=bus, node=node, new=new, save=save)
+        change: Change = await self._session.call("set_id", {"bus": bus, "node": node, "new": new, "save": save})
         return change
 
     async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
-        change: Change = await self._session.call("set_baudrate", 3 * PATIENCE, bus=bus, node=node, baudrate=baudrate, save=save)
+        params = {"bus": bus, "node": node, "baudrate": baudrate, "save": save}
+        change: Change = await self._session.call("set_baudrate", params)
         return change
 
     async def command(self, bus: str, node: int, name: str, value: int | None = None) -> tuple[str, ...]:
-        told: tuple[str, ...] = await self._session.call("command", 3 * PATIENCE, bus=bus, node=node, name=name, value=value)
+        told: tuple[str, ...] = await self._session.call("command", {"bus": bus, "node": node, "name": name, "value": value})
         return told
 
-    def stats(self) -> dict[str, Any]:
-        """At most a second old, from the first call on."""
-        if not self._session.stats_wanted and self._session.wire is not None:
-            self._session.stats_wanted = True
-            self._session.task(self._quietly(self._session.follow_stats()))
-        return self._session.stats
-
-    @staticmethod
-    async def _quietly(work: Any) -> None:
-        with suppress(LinkDown):
-            await work
-
-    async def config(self) -> dict[str, Any]:
-        """The daemon's buses, as plain data."""
-        found: dict[str, Any] = await self._session.call("config")
-        return found
-
-    async def acquire(self, *names: str) -> None:
-        full = self.full_names(names)
-        await self._session.call("acquire", names=full)
-        self._session.lost -= set(full)
-        self._session.held |= set(full)
-
-    async def release(self, *names: str) -> None:
-        full = self.full_names(names)
-        self._session.held -= set(full)
-        await self._session.call("release", names=full)
-
     async def reload(self) -> Reload:
-        report: Reload = await self._session.call("reload", 3 * PATIENCE)
-        await self._session.rename()
+        report: Reload = await self._session.call("reload", {})
+        await self._rename()
+        await self._refresh()
         return report
 
 
-def _refuse(goal: Goal) -> None:
-    """What JSON cannot carry, in the words of every rig."""
-    for key in ("value", "speed", "duration", "acceleration", "effort", "deadline"):
-        value = getattr(goal, key)
-        if value is not None and not is_number(value):
-            raise LimitError(f"{goal.kind if key == 'value' else key} {value!r} is not a finite number: nothing was sent")
+def _about(names: Collection[str], told: dict[str, T]) -> dict[str, T]:
+    """An answer about other servos is none."""
+    if told.keys() != set(names):
+        raise ValueError(f"an answer about {', '.join(told) or 'nothing'}, not about {', '.join(names)}")
+    return told
 
 
-@asynccontextmanager
-async def connect(
-    address: str | Path | None = None,
-    *,
-    name: str = "",
-    token: str | None = None,
-    tls: ssl.SSLContext | None = None,
-    refresh_hz: float = REFRESH_HZ,
-) -> AsyncIterator[RemoteRig]:
-    """The rig of a running daemon. `address`: its socket, or `tcp://host:port` with a `token`, and `tls` where it is not this
-    machine; None: where a daemon of this machine has it. `name`: what others are told of who moves a servo. Left in order, what
-    moves goes on; left by an error, its servos do their `on_lost_client`.
-    Raises LinkDown, AccessDenied, NotSupported."""
-    target = str(find_socket() or socket_path()) if address is None else str(address)
-
-    async def dial() -> Wire:
-        return await open_wire(target, tls)
-
-    session = Session(dial, name, token, refresh_hz)
-    await session.open()
-    try:
-        yield RemoteRig(session)
-    except BaseException:
-        await session.close(release=False)
-        raise
-    await session.close(release=True)
+def _bounded(seconds: float) -> float:
+    """JSON has no infinity."""
+    return seconds if seconds < FOREVER else FOREVER

@@ -9,18 +9,18 @@ from dataclasses import replace
 
 from servobus.errors import LimitError
 from servobus.protocols.options import ServoOptions
-from servobus.protocols.words import Goal, is_number
+from servobus.protocols.words import GOAL_NUMBERS, Goal, is_number, no_number
 
 
 def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:
     """The goal to send: the same, or clamped where the servo says so. `setpoint` is the last position asked for or seen.
     Raises LimitError."""
-    for field in ("value", "speed", "duration", "acceleration", "effort", "deadline"):
+    for field in GOAL_NUMBERS:
         value = getattr(goal, field)
         if value is None and field != "value":
             continue
         if not is_number(value):
-            raise LimitError(f"{field}: {_shown(value)} is not a finite number", servo=name)
+            raise LimitError(no_number(field, value), servo=name)
         if field != "value" and (value < 0 or (value == 0 and field != "speed")):
             raise LimitError(f"{field}: {value:g} must be above 0", servo=name)
     if goal.speed is not None and goal.duration is not None:
@@ -40,11 +40,6 @@ def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | N
                 raise LimitError(f"duration: {goal.duration:g} s {reason}", servo=name)
             goal = replace(goal, duration=fastest)
     return goal
-
-
-def _shown(value: object) -> str:
-    huge = isinstance(value, int) and not isinstance(value, bool)  # Python itself refuses to print it
-    return "a huge integer" if huge else repr(value)[:40]
 
 
 def _position(name: str, value: float, options: ServoOptions, setpoint: float | None) -> float:

@@ -43,6 +43,10 @@ class Goal:
     """Seconds from acceptance within which its first byte must leave; None: the servo's `ttl`."""
 
 
+GOAL_NUMBERS = ("value", "speed", "duration", "acceleration", "effort", "deadline")
+"""The fields of a goal that are finite numbers; all but `value` may be None."""
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """position = direction * (raw - zero) * unit_per_step, as DESIGN section 7 rules."""
@@ -171,3 +175,9 @@ def is_number(value: object) -> bool:
         return math.isfinite(value)
     except OverflowError:  # an integer no float can hold
         return False
+
+
+def no_number(what: str, value: object) -> str:
+    """What to say of a value that `is_number` refuses."""
+    huge = isinstance(value, int) and not isinstance(value, bool)  # Python itself refuses to print it
+    return f"{what}: {'a huge integer' if huge else repr(value)[:40]} is not a finite number"

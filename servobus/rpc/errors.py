@@ -3,6 +3,7 @@ the other end as what they were."""
 
 from __future__ import annotations
 
+import functools
 import inspect
 from typing import Any
 
@@ -20,13 +21,30 @@ TYPES: dict[str, type[ServobusError]] = {
 
 def encoded(error: ServobusError) -> dict[str, Any]:
     """As JSON-RPC has it: code, message for people, data for programs."""
-    data: dict[str, Any] = {"type": type(error).__name__, "message": error.message}
+    known, *also = _known(type(error))
+    data: dict[str, Any] = {"type": known, "message": error.message} | ({"also": also} if also else {})
     data |= {key: value for key, value in (("bus", error.bus), ("servo", error.servo), ("raw", error.raw.hex())) if value}
     if isinstance(error, DeviceError) and error.code is not None:
         data["code"] = error.code
     if isinstance(error, PartialFailure):
         data["results"] = {name: _result(result) for name, result in error.results.items()}
     return {"code": FAILED, "message": str(error), "data": data}
+
+
+def _known(kind: type[ServobusError]) -> list[str]:
+    """The class of the tree that it is, or those that a finer kind of a protocol stands for."""
+    kinds = [base for base in kind.__mro__ if base in TYPES.values()]
+    return [base.__name__ for base in kinds if not any(base is not other and issubclass(other, base) for other in kinds)]
+
+
+@functools.lru_cache(maxsize=256)
+def _kind(known: str, also: tuple[str, ...]) -> type[ServobusError]:
+    """The inverse."""
+    kinds = [TYPES[name] for name in dict.fromkeys((known, *also)) if name in TYPES] or [ServobusError]
+    try:
+        return kinds[0] if len(kinds) == 1 else type(kinds[0].__name__, tuple(kinds), {})
+    except TypeError:  # they do not go together
+        return kinds[0]
 
 
 def _result(result: Any) -> Any:
@@ -45,13 +63,19 @@ def decoded(error: Any) -> Exception:
         return TypeError(message)
     if not isinstance(data, dict) or not isinstance(data.get("type"), str):
         return ServobusError(f"the daemon could not do it: {message}")
-    kind = TYPES.get(data["type"], ServobusError)
-    where: dict[str, Any] = {"bus": data.get("bus"), "servo": data.get("servo"), "raw": _bytes(data.get("raw"))}
-    if kind is PartialFailure:
-        return PartialFailure({name: _unresult(result) for name, result in dict(data.get("results", {})).items()}, **where)
+    also = data.get("also")
+    kind = _kind(data["type"], tuple(also[:8]) if isinstance(also, list) and all(isinstance(name, str) for name in also) else ())
+    where: dict[str, Any] = {key: str(data[key]) for key in ("bus", "servo") if data.get(key)} | {"raw": _bytes(data.get("raw"))}
+    if issubclass(kind, PartialFailure):
+        results = data.get("results")
+        return PartialFailure(
+            {name: _unresult(one) for name, one in results.items()} if isinstance(results, dict) else {}, **where
+        )
+    said = str(data.get("message", message))
     if issubclass(kind, DeviceError):
-        return kind(data.get("message", message), code=data.get("code"), **where)
-    return kind(data.get("message", message), **where)
+        number = data.get("code")
+        return kind(said, code=number if isinstance(number, int) else None, **where)
+    return kind(said, **where)
 
 
 def _bytes(text: Any) -> bytes:

@@ -10,9 +10,9 @@ from typing import Any
 
 import msgspec
 
-from servobus.access import Role
 from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
 from servobus.rig import Found, Reload
+from servobus.roles import Role
 
 PROTOCOL = 1
 """Of these messages: a client of another one is told so at `hello`."""
@@ -128,7 +128,7 @@ class Scan(Params):
     baudrates: tuple[int, ...] = ()
     ids: tuple[int, ...] = ()
     progress: bool = False
-    """Notifications `progress` while it lasts."""
+    """Notices `progress` {bus, asked, count, found} while it lasts."""
 
 
 class SetId(Params):
@@ -153,7 +153,10 @@ class Command(Params):
 
 
 class Subscribe(Params):
-    """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`."""
+    """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`.
+
+    Notices: `state` {subscription, stopped, missed, states}, `event` {subscription, name, time, fields, missed}, `stats`
+    {subscription, missed, stats}."""
 
     topic: str
     hz: float = 10.0

@@ -124,7 +124,7 @@ async def _daemon(stack: AsyncExitStack, options: Options) -> RemoteRig | None:
     except LinkDown:
         return None  # nobody listens there any more
     if options.config is not None:
-        theirs = (await rig.config())["buses"]
+        theirs = (await rig.call("config"))["buses"]
         if not any(name in theirs and theirs[name]["port"] == bus.port for name, bus in options.setup.buses.items()):
             await stack.aclose()
             return None
@@ -140,7 +140,7 @@ async def _hinted(error: PortBusy) -> PortBusy:
         return error
     try:
         async with connect(path) as rig:
-            pid = rig.greeting.pid
+            pid = (await rig.call("hello")).pid
     except LinkDown:
         return error
     hint = f"{error.message}; the servobus daemon (pid {pid}) owns it: leave --direct out, or stop the daemon"

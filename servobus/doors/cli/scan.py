@@ -120,7 +120,7 @@ class Search:
         only = [] if self._bus is None else [self._bus]
         async with opened(self._options, only=only, before=self._check) as rig:
             if isinstance(rig, RemoteRig):
-                buses = (await rig.config())["buses"]
+                buses = (await rig.call("config"))["buses"]
                 self._choose({name: Line(name, bus["protocol"], bus["port"]) for name, bus in buses.items()})
             yield rig
 

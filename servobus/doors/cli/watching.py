@@ -82,7 +82,7 @@ def _picture(snapshot: Snapshot) -> Any:
 async def _unpolled(rig: Rig, names: list[str]) -> list[str]:
     """Those whose state nobody else keeps fresh."""
     if isinstance(rig, RemoteRig):
-        polled = {bus: any((data["poll"] or {}).values()) for bus, data in (await rig.config())["buses"].items()}
+        polled = {bus: any((data["poll"] or {}).values()) for bus, data in (await rig.call("config"))["buses"].items()}
     elif isinstance(rig, LocalRig):
         polled = {bus: bool(options.poll.rates()) for bus, options in rig.config.buses.items()}
     return [name for name in names if not polled[rig.names[name][0]]]

@@ -140,7 +140,7 @@ def scan(client: Connection, params: rpc.Scan) -> LATER:
         raise LimitError("ids are 0 to 255, and there is an end to their number: scan fewer")
 
     def progress(asked: int, total: int, hit: Found | None) -> None:
-        client.notify("progress", {"bus": params.bus, "asked": asked, "total": total, "found": hit})
+        client.notify("progress", {"bus": params.bus, "asked": asked, "count": total, "found": hit})
 
     told = progress if params.progress else None
     return client.door.rig.scan(params.bus, baudrates=params.baudrates, ids=params.ids, progress=told)
