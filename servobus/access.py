@@ -26,11 +26,15 @@ PATTERN = r"^@?[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?$"
 Who = Annotated[str, Field(pattern=PATTERN)]
 
 
+Users = Annotated[tuple[Who, ...], Field(strict=False)]
+"""YAML has lists."""
+
+
 class AccessOptions(Data):
     """Users, or groups as `@name`. Nothing given: the owner of the daemon and root are admin, all others observer."""
 
-    admin: tuple[Who, ...] = ()
-    operator: tuple[Who, ...] = ()
+    admin: Users = ()
+    operator: Users = ()
 
     @field_validator("admin", "operator")
     @classmethod

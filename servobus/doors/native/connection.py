@@ -71,6 +71,8 @@ class Connection(asyncio.Protocol):
         self._working = False
         self._resting = False
         self._closed = False
+        self._over = False
+        """It says nothing more."""
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport
 
@@ -116,7 +118,10 @@ class Connection(asyncio.Protocol):
         self._work()
 
     def eof_received(self) -> bool:
-        """What it asked before it ended is answered: `nc` does that."""
+        """What it asked before it ended is answered first: `nc` ends so."""
+        self._over = True
+        if not (self._lines or self._tasks):
+            return False
         self.door.loop.call_later(PATIENCE, self._transport.close)
         return True
 
@@ -175,6 +180,7 @@ class Connection(asyncio.Protocol):
             self.door.loop.call_later(wait, self._go_on)  # it stays `working`: nothing else begins its next turn
             return False
         self._working = bool(self._lines) and not (self.blocked or len(self._tasks) >= MOST_TASKS)
+        self._leave_if_done()
         return self._working
 
     def _go_on(self) -> None:
@@ -261,6 +267,11 @@ class Connection(asyncio.Protocol):
     def _done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         self._work()
+        self._leave_if_done()
+
+    def _leave_if_done(self) -> None:
+        if self._over and not (self._lines or self._tasks or self._closed):
+            self._transport.close()
 
     # What it is told
 
