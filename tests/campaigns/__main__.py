@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import faults, kst, line, slow, turns
+from tests.campaigns import daemon, faults, kst, line, slow, turns
 from tests.campaigns.oracle import ORACLES
 
 
@@ -59,9 +59,20 @@ def bench_kst(_: int) -> bool:
     return min(kst.main().values()) >= 0.9
 
 
+def soak_kill(_: int) -> bool:
+    result = daemon.kills(200)
+    result.report()
+    return not (result.late or result.writes)
+
+
+def bench_door(_: int) -> bool:
+    ratio, each = daemon.door()
+    return ratio <= 2.0 and each <= 40.0
+
+
 CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
-    "soak": {"faults": soak_faults, "cancel": soak_cancel, "hand": soak_hand, "line": soak_line},
-    "bench": {"turns": bench_turns, "kst": bench_kst},
+    "soak": {"faults": soak_faults, "cancel": soak_cancel, "hand": soak_hand, "line": soak_line, "kill": soak_kill},
+    "bench": {"turns": bench_turns, "kst": bench_kst, "door": bench_door},
 }
 
 
