@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import daemon, faults, kst, line, slow, turns
+from tests.campaigns import crowd, daemon, faults, kst, line, slow, turns
 from tests.campaigns.oracle import ORACLES
 
 
@@ -65,13 +65,26 @@ def soak_kill(_: int) -> bool:
     return not (result.late or result.writes)
 
 
+def soak_daemon(_: int) -> bool:
+    result = crowd.crowd()
+    result.report()
+    return result.kept()
+
+
 def bench_door(_: int) -> bool:
     ratio, each = daemon.door()
     return ratio <= 2.0 and each <= 40.0
 
 
 CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
-    "soak": {"faults": soak_faults, "cancel": soak_cancel, "hand": soak_hand, "line": soak_line, "kill": soak_kill},
+    "soak": {
+        "faults": soak_faults,
+        "cancel": soak_cancel,
+        "hand": soak_hand,
+        "line": soak_line,
+        "kill": soak_kill,
+        "daemon": soak_daemon,
+    },
     "bench": {"turns": bench_turns, "kst": bench_kst, "door": bench_door},
 }
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable
-from inspect import isawaitable
+from types import CoroutineType
 from typing import TYPE_CHECKING, Any, cast
 
 import structlog
@@ -162,7 +162,11 @@ class Connection(asyncio.Protocol):
     def _work(self) -> None:
         if self._lines and not (self._working or self._closed or self.blocked or len(self._tasks) >= MOST_TASKS):
             self._working = True
-            self.door.work.add(self._turn)
+            more = True
+            while more and self.door.work.at_once():  # goals that came together leave together
+                more = self._turn()
+            if more:
+                self.door.work.add(self._turn)
 
     def _turn(self) -> bool:
         """One line; whether there is another to be done at once."""
@@ -208,7 +212,7 @@ class Connection(asyncio.Protocol):
             self.write(call.answer() + b"\n")
             return
         result = self._begin(call)
-        if isawaitable(result):
+        if isinstance(result, CoroutineType):
             self._spawn(self._finish(call, result))
         elif call.wants_answer:
             self.write(self._told(call, result) + b"\n")
@@ -252,7 +256,7 @@ class Connection(asyncio.Protocol):
 
     @staticmethod
     async def _ended(result: Any) -> Any:
-        if not isawaitable(result):
+        if not isinstance(result, CoroutineType):
             return result
         try:
             return await result

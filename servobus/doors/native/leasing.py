@@ -23,6 +23,7 @@ class Leasing:
         self._rig = rig
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
         self._labels: dict[Hashable, str] = {}
         self._stopping: set[asyncio.Task[None]] = set()
 
@@ -67,12 +68,13 @@ class Leasing:
 
     def _watch(self) -> None:
         expiry = self.leases.next_expiry()
-        if expiry is not None and (self._timer is None or self._timer.cancelled() or self._timer.when() > expiry):
+        if expiry is not None and (self._timer is None or self._timer_at > expiry):
             self._arm(expiry)
 
     def _arm(self, when: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
+        self._timer_at = when
         self._timer = self._loop.call_at(when, self._expire)
 
     def _expire(self) -> None:

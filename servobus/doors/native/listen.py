@@ -24,7 +24,7 @@ CREDENTIALS = struct.Struct("3i")
 LEAST_TOKEN = 32
 TRIES, WINDOW = 5, 60.0
 """Wrong tokens of one address in so many seconds; then it waits that long."""
-BACKLOG = 128
+BACKLOG = 1024
 
 
 def peer_credentials(sock: socket.socket) -> tuple[int, int, int]:

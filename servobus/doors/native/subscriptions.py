@@ -60,6 +60,8 @@ class Subscriptions:
         self._heap: list[Subscription] = []
         self._of: dict[Connection, dict[int, Subscription]] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        """Kept here: a timer of uvloop that is due already does not say when."""
         self._written: dict[str, bytes] = {}
         self._written_at = -1.0
         self._unlisten = rig.announcer.listen(self._event)
@@ -105,10 +107,11 @@ class Subscriptions:
             self._timer.cancel()
 
     def _arm(self) -> None:
-        if self._heap and (self._timer is None or self._timer.when() > self._heap[0].due):
+        if self._heap and (self._timer is None or self._timer_at > self._heap[0].due):
             if self._timer is not None:
                 self._timer.cancel()
-            self._timer = self._loop.call_at(self._heap[0].due, self._tick)
+            self._timer_at = self._heap[0].due
+            self._timer = self._loop.call_at(self._timer_at, self._tick)
 
     def _tick(self) -> None:
         self._timer = None

@@ -22,12 +22,27 @@ class Work:
         self._now = now
         self._turns: deque[Callable[[], bool]] = deque()
         self._due = False
+        self._until: float | None = None
+        """When what may be done at once in this pass is used up."""
 
     def add(self, turn: Callable[[], bool]) -> None:
         self._turns.append(turn)
         if not self._due:
             self._due = True
             self._loop.call_soon(self._run)
+
+    def at_once(self) -> bool:
+        """Nobody waits, and of this pass of the loop something is left: a piece may be done without waiting for a share."""
+        if self._due:
+            return False
+        now = self._now()
+        if self._until is None:
+            self._until = now + BUDGET
+            self._loop.call_soon(self._pass_over)
+        return now < self._until
+
+    def _pass_over(self) -> None:
+        self._until = None
 
     def _run(self) -> None:
         end = self._now() + BUDGET
