@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import stat
 from pathlib import Path
 
 import anyio
@@ -14,6 +15,7 @@ from servobus.config import load_config
 from servobus.doors.cli.common import Number, logs
 from servobus.doors.cli.common import run as run_loop
 from servobus.doors.daemon.main import serve_rig
+from servobus.errors import ConfigError
 from servobus.rpc.place import socket_path
 from servobus.sim.serve import serve
 
@@ -35,6 +37,8 @@ def run(config: str, log_every: float) -> None:
     """
     logs(logging.INFO)
     load_config(config)  # what is wrong with it is told before anything is claimed
+    if Path(config).stat().st_mode & stat.S_IWOTH:
+        raise ConfigError(f"{config}: everybody may write to it, and so say what this daemon does: chmod o-w {config}")
     try:
         run_loop(lambda: serve_rig(config, socket_path(), log_every), terminated=0, endings=[signal.SIGTERM])
     finally:

@@ -110,6 +110,62 @@ def test_run_waits_for_a_port(tmp_path: Path) -> None:
         assert process.wait(10) == 0
 
 
+def test_a_config_that_everybody_may_write_is_not_run(rig: str) -> None:
+    os.chmod(rig, 0o666)
+    with servobus("run", rig) as process:
+        _, told = process.communicate(timeout=20)
+        assert process.returncode == 2
+        assert "everybody may write to it" in told
+
+
+def test_a_second_daemon_is_refused_with_the_pid_of_the_first(rig: str) -> None:
+    with servobus("run", rig) as first:
+        until(first, "running")
+        with servobus("run", rig) as second:
+            _, told = second.communicate(timeout=20)
+            assert second.returncode == 1
+            assert f"daemon (pid {first.pid}) listens at" in told
+        first.terminate()
+        assert first.wait(10) == 0
+
+
+def test_a_reload_by_signal(rig: str) -> None:
+    with servobus("run", rig) as process:
+        until(process, "running")
+        text = Path(rig).read_text()
+        Path(rig).write_text(text.replace("id: 1", "id: 999"))
+        process.send_signal(signal.SIGHUP)
+        assert "found 999" in str(until(process, "reload_refused")["reason"])
+        Path(rig).write_text(text.replace("id: 1", "id: 9"))
+        process.send_signal(signal.SIGHUP)
+        assert until(process, "reloaded")["changed"] == ["arm"]
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_the_commands_talk_to_the_daemon(rig: str) -> None:
+    """Enable, move, stop and clear by processes of their own, each without a config."""
+    with servobus("run", rig) as daemon:
+        until(daemon, "running")
+        ended = []
+        for command in (
+            ("enable",),
+            ("move", "shoulder=10"),
+            ("stop",),
+            ("move", "shoulder=0"),
+            ("clear",),
+            ("clear",),
+            ("stats",),
+        ):
+            with servobus(*command) as process:
+                out, err = process.communicate(timeout=20)
+                ended.append((command[0], process.returncode))
+                assert "not latched" not in out + err
+        assert ended == [("enable", 0), ("move", 0), ("stop", 0), ("move", 1), ("clear", 0), ("clear", 0), ("stats", 0)]
+        daemon.terminate()
+        assert daemon.wait(10) == 0
+
+
 def test_a_simulator_and_a_daemon_on_its_port(rig: str, tmp_path: Path) -> None:
     with servobus("sim", rig, "--folder", str(tmp_path / "ports")) as sim:
         assert sim.stdout is not None
