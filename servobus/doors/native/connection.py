@@ -1,8 +1,8 @@
 """One client of the native door: an asyncio protocol.
 
-A call of `stop` is looked for in whatever has come, and done before anything else. The other lines wait for their share of the
-loop, in turn with those of all other clients. A client that says more than its rate is read more slowly; one that does not read
-what it is told is not told more, and left when that lasts.
+A call of `stop`, or `renew`, is looked for in whatever has come, and done before anything else. The other lines wait for their
+share of the loop, in turn with those of all other clients. A client that says more than its rate is read more slowly; one that
+does not read what it is told is not told more, and left when that lasts.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import structlog
 
 from servobus.access import Role
 from servobus.doors.native.messages import (
+    URGENT,
     Call,
     Framer,
     Refused,
@@ -26,6 +27,7 @@ from servobus.doors.native.messages import (
     failure,
     notification,
     parse,
+    urgent,
 )
 from servobus.doors.native.verbs import VERBS, require
 from servobus.doors.native.work import Bucket
@@ -35,15 +37,17 @@ from servobus.rpc.methods import Hello
 if TYPE_CHECKING:
     from servobus.doors.native.door import NativeDoor
 
-MOST_LINES = 64
-"""Lines of one client that may wait; then it is not read until they are fewer."""
-MOST_TASKS = 32
-"""Calls of one client under way at once."""
+MOST_WAITING = 256 * 1024
+"""Bytes of one client that may wait; then it is not read until they are fewer. Well above what our own client lets wait, so that
+its `stop` is always read."""
+MOST_TASKS = 256
+"""Calls of one client under way at once, above which only the urgent ones begin."""
 MOST_UNREAD = 256 * 1024
 """Bytes that a client may be behind with its reading."""
 PATIENCE = 10.0
 """Seconds after which one that reads nothing is left."""
-STOP = b'"stop"'
+OVERHEAD = 64
+"""Bytes that a line takes besides what it says."""
 LABEL = 64
 
 log = structlog.get_logger("servobus")
@@ -67,6 +71,8 @@ class Connection(asyncio.Protocol):
         self._tcp = tcp
         self._framer = Framer()
         self._lines: deque[bytes] = deque()
+        self._waiting = 0
+        """Bytes that they take."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._working = False
         self._resting = False
@@ -137,25 +143,19 @@ class Connection(asyncio.Protocol):
             self.write(refusal.answer() + b"\n")
             self._transport.close()
             return
+        ahead = set(URGENT)  # of each, one in what came together: a flood of them waits as any other
         for line in lines:
-            if not (STOP in line and self._stopped(line)):
+            found = urgent(line) & ahead
+            if found:
+                ahead -= found
+                self._do(line)
+            elif line.strip():
                 self._lines.append(line)
-        if len(self._lines) > MOST_LINES and not self._resting:
+                self._waiting += len(line) + OVERHEAD
+        if self._waiting > MOST_WAITING and not self._resting:
             self._resting = True
             self._transport.pause_reading()
         self._work()
-
-    def _stopped(self, line: bytes) -> bool:
-        """Whether it was a call of `stop`, which is begun then."""
-        try:
-            (message,) = parse(line)
-            call = call_of(message)
-        except (Refused, ValueError):
-            return False  # its turn comes, and with it what is wrong with it
-        if call.method != "stop":
-            return False
-        self._answer_later([call], batch=False)
-        return True
 
     # Its share of the loop
 
@@ -174,9 +174,9 @@ class Connection(asyncio.Protocol):
             self._working = False
             return False
         line = self._lines.popleft()
-        if line.strip():
-            self._do(line)
-        if self._resting and len(self._lines) <= MOST_LINES // 2 and not self._closed:
+        self._waiting -= len(line) + OVERHEAD
+        self._do(line)
+        if self._resting and self._waiting <= MOST_WAITING // 2 and not self._closed:
             self._resting = False
             self._transport.resume_reading()
         wait = self._bucket.take(self.door.now())
@@ -203,9 +203,8 @@ class Connection(asyncio.Protocol):
                 calls.append(call_of(message))
             except Refused as refusal:
                 calls.append(refusal)
-        batch = line.lstrip().startswith(b"[")
-        if batch or len(calls) > 1:
-            self._answer_later(calls, batch=True)
+        if line.lstrip().startswith(b"["):
+            self._spawn(self._batch(calls))
             return
         (call,) = calls
         if isinstance(call, Refused):
@@ -232,22 +231,19 @@ class Connection(asyncio.Protocol):
             return failure(call.id, result)
         return answered(call.id, result)
 
-    def _answer_later(self, calls: list[Call | Refused] | list[Call], *, batch: bool) -> None:
-        """Begin them all, now and in their order; the answers leave together."""
-        begun = [(call, call if isinstance(call, Refused) else self._begin(call)) for call in calls]
-        self._spawn(self._gather(begun, batch))
-
-    async def _gather(self, begun: list[tuple[Call | Refused, Any]], batch: bool) -> None:
-        answers = []
-        for call, result in begun:
+    async def _batch(self, calls: list[Call | Refused]) -> None:
+        """One after the other, what is urgent first; the answers leave together, in the order of the calls."""
+        answers: dict[int, bytes] = {}
+        for at in sorted(range(len(calls)), key=lambda at: getattr(calls[at], "method", "") not in URGENT):
+            call = calls[at]
             if isinstance(call, Refused):
-                answers.append(call.answer())
+                answers[at] = call.answer()
                 continue
-            told = await self._ended(result)
+            told = await self._ended(self._begin(call))
             if call.wants_answer:
-                answers.append(self._told(call, told))
+                answers[at] = self._told(call, told)
         if answers:
-            self.write((b"[%b]" % b",".join(answers) if batch else answers[0]) + b"\n")
+            self.write(b"[%b]\n" % b",".join(answers[at] for at in sorted(answers)))
 
     async def _finish(self, call: Call, result: Awaitable[Any]) -> None:
         told = await self._ended(result)

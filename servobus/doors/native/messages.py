@@ -20,6 +20,9 @@ STRING = re.compile(rb'"(?:[^"\\]|\\.)*"')
 STEP = {ord("{"): 1, ord("["): 1, ord("}"): -1, ord("]"): -1}
 encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder().decode
+URGENT = frozenset({"stop", "renew"})
+"""Methods that wait for nothing that came before them."""
+_urgent = re.compile(rb'"(?:%b)"' % b"|".join(name.encode() for name in sorted(URGENT)))
 NO_ID = object()
 """Of a notification: nobody waits for its answer."""
 
@@ -49,6 +52,25 @@ class Call:
     @property
     def wants_answer(self) -> bool:
         return self.id is not NO_ID
+
+
+class _Head(msgspec.Struct):
+    method: Any = None
+
+
+_heads = msgspec.json.Decoder(_Head | list[_Head]).decode
+
+
+def urgent(line: bytes) -> set[str]:
+    """Which of the urgent methods a line calls. It is not looked at otherwise, and may yet be refused."""
+    if not _urgent.search(line):
+        return set()
+    try:
+        heads = _heads(line)
+    except (ValueError, RecursionError):
+        return set()  # its turn comes, and with it what is wrong with it
+    called = [head.method for head in (heads if isinstance(heads, list) else [heads])]  # of any type yet
+    return {name for name in URGENT if name in called}
 
 
 class Framer:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from servobus.doors.native.connection import MOST_TASKS, MOST_WAITING
 from servobus.rpc.methods import MAX_BATCH, MAX_LINE, MAX_SUBSCRIPTIONS
 from tests.doors.native.raw import dialled, served
 from tests.rigs import config, devices
@@ -108,6 +109,50 @@ async def test_a_stop_goes_before_everything_that_came_with_it(tmp_path: Path) -
         report = next(answer["result"] for answer in answers if answer["id"] == stop)
         assert all(entry["written"] and entry["confirmed"] for entry in report.values())
         assert rig.stopped
+
+
+@virtual
+async def test_stops_and_renewals_wait_for_no_call_under_way(tmp_path: Path) -> None:
+    """More calls that take long than may be under way at once, and another that waits for them."""
+    async with served(tmp_path, config(*SLOW), rate=50) as (rig, _, path), dialled(path) as raw:
+        await raw.call("enable")
+        assert await raw.call("move_to", name="s1", position=60) == "acked"
+        for _ in range(MOST_TASKS + 10):
+            raw.ask("settle", names=["s1"], timeout=100, tolerance=0.001)
+        late = raw.ask("names")
+        for _ in range(8):
+            await asyncio.sleep(0.2)
+            lease = await raw.call("renew")
+            assert lease["names"] == ["arm/s1"]
+        assert (rig.snapshot()["arm/s1"].position or 0) > 20, "its lease held over more than its time"
+        raw.say(json.dumps([{"jsonrpc": "2.0", "id": 0, "method": method} for method in ("names", "stop")]).encode() + b"\n")
+        told = await raw.line()
+        while not isinstance(told, list):
+            assert told["id"] != late
+            told = await raw.line()
+        assert told[1]["result"]["arm/s1"]["confirmed"]
+
+
+@virtual
+async def test_a_flood_of_stops_waits_as_any_other(tmp_path: Path) -> None:
+    async with served(tmp_path, rate=None) as (rig, _, path), dialled(path) as raw, dialled(path) as other:
+        stops = [raw.ask("stop") for _ in range(1000)]
+        asked = other.ask("names")
+        assert (await other.line())["id"] == asked
+        assert {(await raw.line())["id"] for _ in stops} == set(stops)
+        assert rig.stopped
+
+
+@virtual
+async def test_who_leaves_in_the_middle_of_a_batch(tmp_path: Path) -> None:
+    async with served(tmp_path) as (_, door, path):
+        async with dialled(path) as raw:
+            calls = [{"jsonrpc": "2.0", "id": at, "method": "settle", "params": {"timeout": 50}} for at in range(3)]
+            raw.say(json.dumps(calls).encode() + b"\n")
+            await asyncio.sleep(0.1)
+            next(iter(door.connections)).abort()
+        await asyncio.sleep(0.1)
+        assert not door.connections
 
 
 @virtual
@@ -247,6 +292,18 @@ async def test_one_above_his_rate_is_read_more_slowly_and_loses_nothing(tmp_path
         numbers = [raw.ask("stopped") for _ in range(60)]
         assert [(await raw.line())["id"] for _ in numbers] == numbers
         assert asyncio.get_running_loop().time() - began == pytest.approx(2, abs=0.2), "20 at once, then 20 a second"
+
+
+@virtual
+async def test_there_is_an_end_to_what_may_wait_and_nothing_of_it_is_lost(tmp_path: Path) -> None:
+    async with served(tmp_path, rate=1000) as (_, door, path), dialled(path) as raw:
+        numbers = [raw.ask("read", name="s1", max_age=3600) for _ in range(8000)]
+        most = 0
+        for number in numbers:
+            assert (await raw.line())["id"] == number
+            most = max(most, next(iter(door.connections))._waiting)
+        assert MOST_WAITING / 2 < most < 3 * MOST_WAITING, "one more piece of the socket may be read before it rests"
+        assert not next(iter(door.connections))._waiting
 
 
 @virtual
