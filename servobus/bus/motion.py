@@ -211,11 +211,9 @@ class Motion:
         near = bus.tolerance(servo) if tolerance is None else tolerance
         end = bus.clock() + timeout
         while True:
-            if self.latched and not parking:
-                raise EStopped("the e-stop came before it stood at its goal", bus=bus.name, servo=servo)
-            if moving and not record.enabled:
-                raise NotEnabled("it was disabled, or has restarted, before it stood at its goal", bus=bus.name, servo=servo)
+            self._refuse_to_settle(record, moving, parking)
             state = await bus.read(servo, SETTLE_PERIOD)
+            self._refuse_to_settle(record, moving, parking)  # a stop or a restart meanwhile has changed its setpoint
             there = record.setpoint is None or (state.position is not None and abs(state.position - record.setpoint) <= near)
             if there and not state.moving and not bus.scheduler.profile.leads(servo):
                 return state
@@ -226,6 +224,14 @@ class Motion:
                     servo=servo,
                 )
             await asyncio.sleep(SETTLE_PERIOD)
+
+    def _refuse_to_settle(self, record: ServoRecord, moving: bool, parking: bool) -> None:
+        if self.latched and not parking:
+            raise EStopped("the e-stop came before it stood at its goal", bus=self._bus.name, servo=record.name)
+        if moving and not record.enabled:
+            raise NotEnabled(
+                "it was disabled, or has restarted, before it stood at its goal", bus=self._bus.name, servo=record.name
+            )
 
     async def park(self, servo: str) -> StopReport:
         """To the park pose within `park_timeout`, then limp, even if it does not get there. The e-stop it serves lets it pass."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from servobus.errors import DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
+from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
 from servobus.protocols.words import Goal, Outcome
 from tests.bus.puppet import Answers, puppet_bus
@@ -88,6 +88,50 @@ async def test_disable_that_does_not_read_back_is_an_error_and_it_is_disabled_fo
         with pytest.raises(DeviceError, match="not confirmed"):
             await bus.motion.disable("s1")
         assert not bus.records["s1"].enabled
+
+
+@virtual
+async def test_disable_waits_for_no_exclusive_session() -> None:
+    async with puppet_bus() as (bus, puppet, _, _), bus.exclusive():
+        puppet.heard.clear()
+        with pytest.raises(LeaseHeld, match="arm/s1"):
+            await bus.motion.disable("s1")
+        assert puppet.heard == []
+
+
+@virtual
+@pytest.mark.parametrize("how", ["disabled", "restarted"])
+async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        puppet.script = keeping()
+        await bus.motion.enable("s1")
+        bus.records["s1"].setpoint = 50.0
+        settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
+        await asyncio.sleep(0.1)
+        assert not settling.done()
+        if how == "disabled":
+            await bus.motion.disable("s1")
+        else:
+            puppet.script = lambda frame: None  # its torque reads 0 again
+            bus.health.suspect_all()
+        with pytest.raises(NotEnabled, match=r"arm/s1.*before it stood at its goal"):
+            await settling
+
+
+@virtual
+async def test_a_stop_while_its_place_is_read_is_not_taken_for_its_goal() -> None:
+    """The hold puts the setpoint where it stands; a read that was under way then would find it there."""
+    async with puppet_bus() as (bus, puppet, _, _):
+        puppet.script = keeping()
+        await bus.motion.enable("s1")
+        bus.records["s1"].setpoint = 50.0
+        puppet.heard.clear()
+        settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
+        while not puppet.heard:
+            await asyncio.sleep(0.0005)
+        await bus.motion.stop()
+        with pytest.raises(EStopped, match="before it stood at its goal"):
+            await settling
 
 
 @virtual

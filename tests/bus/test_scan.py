@@ -11,7 +11,7 @@ from servobus.bus.scan import scan
 from servobus.errors import LinkDown, NotSupported
 from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction
-from tests.bus.puppet import puppet_bus
+from tests.bus.puppet import Answers, puppet_bus
 from tests.virtual import virtual
 
 
@@ -47,6 +47,23 @@ async def test_a_servo_that_answers_only_ping_is_found_without_a_name() -> None:
         hits = [hit async for _, _, hit in scan(bus, [bus.options.baudrate], [9]) if hit]
         assert len(hits) == 1
         assert hits[0][2] is None
+
+
+@virtual
+@pytest.mark.parametrize("there", [True, False])
+async def test_an_answer_that_looks_like_the_question_is_asked_for_in_another_way(there: bool) -> None:
+    """A servo whose health byte is 1 answers PING with the very bytes of PING; so does a line that echoes."""
+    async with puppet_bus() as (bus, puppet, _, _):
+
+        def script(frame: bytes) -> Answers | None:
+            if frame[4] == Instruction.PING:
+                return [(0.001, frame)]
+            return None if there else []
+
+        puppet.script = script
+        hits = [hit async for _, _, hit in scan(bus, [bus.options.baudrate], [9]) if hit]
+        assert [hit[0] for hit in hits] == ([9] if there else [])
+        assert [frame[4] for frame in puppet.heard[:2]] == [Instruction.PING, Instruction.READ]
 
 
 @virtual

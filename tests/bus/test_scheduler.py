@@ -11,9 +11,10 @@ import pytest
 from servobus.bus.grid import PollTimer
 from servobus.bus.health import FIRST_DEADLINE, GREATEST_BACKOFF
 from servobus.bus.queue import Job
-from servobus.bus.scheduler import POLL_PATIENCE
+from servobus.bus.scheduler import POLL_PATIENCE, PROBE_PAUSE
 from servobus.errors import (
     ActionWithheld,
+    DeviceError,
     EStopped,
     GoalExpired,
     NotEnabled,
@@ -231,6 +232,16 @@ def test_a_probe_finds_that_a_servo_has_restarted() -> None:
     bench.driver.restarted.add(1)
     finish(bench.scheduler.next_turn(0.0))
     assert bench.restarts == [1]
+
+
+def test_a_probe_that_is_refused_is_not_repeated_at_once() -> None:
+    bench = Bench(1, online=False)
+    taken = bench.scheduler.next_turn(5.0)
+    assert taken is not None
+    taken.fail(DeviceError("not now"))
+    assert bench.node(1).next_probe == 5.0 + PROBE_PAUSE
+    assert bench.scheduler.next_turn(5.0) is None
+    assert kind(bench.scheduler.next_turn(5.0 + PROBE_PAUSE)) == "probe"
 
 
 def test_it_is_woken_for_the_next_probe() -> None:

@@ -132,18 +132,23 @@ class GoalWriter:
         silent = [part.servo.name for part in parts if part not in armed]
         if silent and self.options.on_partial == "abort":
             return f"{', '.join(silent)} did not acknowledge its REG WRITE (on_partial: abort)"
+        reason = ""
         for node in sorted(self.maybe_armed.keys() - {part.servo.node for part in parts}):
-            servo = self.maybe_armed[node]
-            try:
-                pending = yield from self._flag(servo)
-            except ServobusError:
-                pending = 1
-            if pending:
-                yield from self._disarm(servo)
-            if pending and node in self.maybe_armed:
-                return f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
-            self.maybe_armed.pop(node, None)
-        return ""
+            reason = reason or (yield from self._suspicion(self.maybe_armed[node]))
+        return reason
+
+    def _suspicion(self, servo: FittedServo) -> Plan[str]:
+        """What is left of it after the servo was asked, and disarmed if need be; empty: nothing."""
+        try:
+            pending = yield from self._flag(servo)
+        except ServobusError:
+            pending = 1
+        if pending:
+            yield from self._disarm(servo)
+        else:
+            self.maybe_armed.pop(servo.node, None)
+        held = f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
+        return held if servo.node in self.maybe_armed else ""
 
     def _flag(self, servo: FittedServo) -> Plan[int]:
         register = servo.model.register("async_write_flag")

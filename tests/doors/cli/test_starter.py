@@ -47,3 +47,11 @@ def test_nothing_but_strangers() -> None:
     made = starter(LINE, [Found("line", 3, 9600, None, None, None)])
     bus = parse_config(made, "made").buses["line"]
     assert (bus.baudrate, bus.servos) == (9600, {})
+
+
+def test_a_hand_is_its_six_fingers() -> None:
+    made = starter(Line("hands", "roh", PORT), [Found("hands", unit, 115_200, "v2", None, None) for unit in (2, 5)])
+    bus = parse_config(made, "made").buses["hands"]
+    assert {servo.id for servo in bus.servos.values()} == {2, 5}
+    assert len(bus.servos) == 12
+    assert {"thumb_bend_2", "thumb_rotation_5"} <= set(bus.servos)

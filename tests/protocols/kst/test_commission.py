@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from servobus.errors import DeviceError, EchoMismatch, LimitError, NotSupported, ReplyTimeout
+from servobus.errors import DeviceError, EchoMismatch, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.kst.codec import FACTORY_ID, Command, encode
 from servobus.protocols.kst.commission import Commissioning
 from tests.protocols.kst.simulated import Bench, device_of
@@ -194,6 +194,17 @@ def test_save_waits_for_no_answer_and_leaves_the_flash_its_time() -> None:
     assert bench.run(commissioning.save(FACTORY_ID)) == ()
     (request,) = bench.said
     assert (request.replies, request.quiet_after) == (0, 0.3)
+
+
+def test_save_is_the_command_with_a_name() -> None:
+    bench, commissioning = new_servo()
+    assert bench.run(commissioning.command(FACTORY_ID, "save")) == ()
+    assert bench.frames() == [encode(FACTORY_ID, Command.SAVE, b"save")]
+    with pytest.raises(UnknownName, match="no command 'factory_reset': there are save"):
+        commissioning.command(FACTORY_ID, "factory_reset")
+    with pytest.raises(LimitError, match="save takes no value: nothing was sent"):
+        commissioning.command(FACTORY_ID, "save", 1)
+    assert bench.frames() == []
 
 
 def test_an_optional_answer_may_be_missing_and_a_refusal_is_told() -> None:

@@ -162,6 +162,24 @@ async def test_a_map_that_is_not_the_pinned_one_is_said_and_refused() -> None:
 
 
 @virtual
+async def test_a_refusal_is_told_with_its_reason_and_without_if_the_line_goes_down_meanwhile() -> None:
+    async with running({"a": TWO["a"]}) as (bus, hands, _):
+        hands[0].refuses_reads_while_busy, hands[0].state, hands[0]._ready = True, "init", 99.0
+        with pytest.raises(DeviceError, match="it is still initialising") as caught:
+            await bus.read_register("a", "stall_speed")
+        assert caught.value.code == 4
+        told, refused = str(caught.value), bus.stats.turns.count
+        reading = asyncio.create_task(bus.read_register("a", "stall_speed"))
+        while bus.stats.turns.count == refused:
+            await asyncio.sleep(0.0005)
+        bus.master.connection_lost(None)
+        with pytest.raises(DeviceError) as caught:
+            await reading
+        assert caught.value.code == 4
+        assert told.startswith(str(caught.value) + "; ")
+
+
+@virtual
 async def test_silence_stands_between_frames() -> None:
     """3.5 characters; 1.75 ms above 19200 baud."""
     heard: list[tuple[bool, float]] = []
