@@ -122,13 +122,18 @@ async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
 async def test_a_stop_while_its_place_is_read_is_not_taken_for_its_goal() -> None:
     """The hold puts the setpoint where it stands; a read that was under way then would find it there."""
     async with puppet_bus() as (bus, puppet, _, _):
-        puppet.script = keeping()
+        keep, asked = keeping(), asyncio.Event()
+        puppet.script = keep
         await bus.motion.enable("s1")
         bus.records["s1"].setpoint = 50.0
-        puppet.heard.clear()
+
+        def script(frame: bytes) -> Answers | None:
+            asked.set()
+            return keep(frame)
+
+        puppet.script = script
         settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
-        while not puppet.heard:
-            await asyncio.sleep(0.0005)
+        await asked.wait()
         await bus.motion.stop()
         with pytest.raises(EStopped, match="before it stood at its goal"):
             await settling

@@ -22,7 +22,7 @@ from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.local import LocalRig
 
 HANDSHAKE = 5.0
-"""Seconds for a TCP client to show its token."""
+"""Seconds for a TCP client to show its token, and before that for TLS."""
 CLOSING = 1.0
 """Seconds that clients get to leave at the end."""
 
@@ -112,7 +112,10 @@ class NativeDoor:
         self._tokens, context = Tokens(tcp), tls_context(tcp)
         try:
             build = partial(Connection, self, tcp=True)
-            server = await self.loop.create_server(build, tcp.host, tcp.port, ssl=context, backlog=BACKLOG)
+            patience = None if context is None else HANDSHAKE
+            server = await self.loop.create_server(
+                build, tcp.host, tcp.port, ssl=context, backlog=BACKLOG, ssl_handshake_timeout=patience
+            )
         except OSError as error:
             raise ConfigError(f"door.tcp: {tcp.host}:{tcp.port} cannot be listened at ({error.strerror})") from None
         self._servers.append(server)

@@ -170,8 +170,10 @@ async def test_a_refusal_is_told_with_its_reason_and_without_if_the_line_goes_do
         assert caught.value.code == 4
         told, refused = str(caught.value), bus.stats.turns.count
         reading = asyncio.create_task(bus.read_register("a", "stall_speed"))
-        while bus.stats.turns.count == refused:
+        for _ in range(1000):
             await asyncio.sleep(0.0005)
+            if bus.stats.turns.count > refused:
+                break
         bus.master.connection_lost(None)
         with pytest.raises(DeviceError) as caught:
             await reading
