@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Generator, Hashable, Mapping, 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
-from servobus.errors import DeviceError, UnknownName
+from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.words import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
@@ -139,8 +139,6 @@ def ask(request: Request[R]) -> Plan[R]:
 
 def run_plan(plan: Plan[R], exchange: Callable[[Request[Any]], Any]) -> R:
     """Run a plan by a plain function: for tests, previews and simulated devices. Errors raised by it go into the plan."""
-    from servobus.errors import ServobusError
-
     try:
         request = next(plan)
         while True:
@@ -190,13 +188,6 @@ class Commissioning(Protocol):
     def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
         """One of `commands`, said once and never repeated; returns what a person should know. Raises UnknownName, LimitError at
         once; then NotSupported, DeviceError."""
-
-
-def known_command(commands: Mapping[str, str], name: str) -> str:
-    """What it does. Raises UnknownName."""
-    if name not in commands:
-        raise UnknownName(f"no command {name!r}: there are {', '.join(f'{each} ({what})' for each, what in commands.items())}")
-    return commands[name]
 
 
 class Driver(Protocol):

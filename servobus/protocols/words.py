@@ -6,9 +6,12 @@ Positions are in the servo's unit, speeds in unit/s, times in seconds.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal, TypeAlias
+
+from servobus.errors import UnknownName
 
 
 class Outcome(StrEnum):
@@ -181,3 +184,10 @@ def no_number(what: str, value: object) -> str:
     """What to say of a value that `is_number` refuses."""
     huge = isinstance(value, int) and not isinstance(value, bool)  # Python itself refuses to print it
     return f"{what}: {'a huge integer' if huge else repr(value)[:40]} is not a finite number"
+
+
+def known_command(commands: Mapping[str, str], name: str) -> str:
+    """What it does. Raises UnknownName."""
+    if name not in commands:
+        raise UnknownName(f"no command {name!r}: there are {', '.join(f'{each} ({what})' for each, what in commands.items())}")
+    return commands[name]

@@ -11,12 +11,12 @@ from dataclasses import replace
 from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols.base import Plan, ask, known_command
+from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import SAVE_WORD, Command
 from servobus.protocols.kst.identity import look
 from servobus.protocols.kst.options import KstBus
 from servobus.protocols.kst.requests import Broadcast, Confirmed, Read, Save, Tell, Wire
-from servobus.protocols.words import Change
+from servobus.protocols.words import Change, known_command
 
 DOUBTFUL_ID = 0xFF
 """The seed allows it as an address; what idle lines look like is a bad name for a servo."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols.base import Plan, ask, known_command
+from servobus.protocols.base import Plan, ask
 from servobus.protocols.modbus.codec import MAX_UNIT
 from servobus.protocols.modbus.requests import ReadHolding
 from servobus.protocols.roh.hand import Hand
-from servobus.protocols.words import Change
+from servobus.protocols.words import Change, known_command
 
 RESTART_PATIENCE = 1.7
 """Seconds the first question after a restart may take; asked three times, that is the 5 s a restart is given."""
