@@ -5,88 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-import termios
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 import pytest
 
 from tests.config_mistakes import GOOD
-
-PLAIN = {
-    name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR", "COLUMNS", "SERVOBUS_CONFIG"}
-}
-LIMP = GOOD.replace("id: 1,", "id: 1, on_exit: limp,")
-
-
-@contextmanager
-def servobus(
-    *arguments: str, stdout: int | IO[bytes] = subprocess.PIPE, stderr: int | IO[bytes] = subprocess.PIPE, **environment: str
-) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "servobus", *arguments],
-        stdout=stdout,
-        stderr=stderr,
-        text=True,
-        env={**PLAIN, **environment},
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-class Terminal:
-    """80 columns wide. `end` is for the program; what it writes there is read here."""
-
-    def __init__(self) -> None:
-        ours, theirs = os.openpty()
-        self._ours, self.end = os.fdopen(ours, "rb", buffering=0), os.fdopen(theirs, "wb", buffering=0)
-        termios.tcsetwinsize(self.end, (24, 80))
-
-    def some(self) -> str:
-        return (self._ours.read(65536) or b"").decode()
-
-    def rest(self) -> str:
-        """Everything written until all writers are gone."""
-        self.end.close()
-        told = ""
-        with suppress(OSError):  # how Linux says that no writer is left
-            while piece := self.some():
-                told += piece
-        return told
-
-    def close(self) -> None:
-        self.end.close()
-        self._ours.close()
-
-
-@pytest.fixture
-def terminal() -> Iterator[Terminal]:
-    with closing(Terminal()) as made:
-        yield made
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> str:
-    path = tmp_path / "rig.yaml"
-    path.write_text(LIMP)
-    return str(path)
-
-
-def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
-    """The first log line of that name."""
-    assert process.stderr is not None
-    for line in process.stderr:
-        entry: dict[str, object] = json.loads(line)
-        if entry["event"] == event:
-            return entry
-    raise AssertionError(f"{event} was never logged")
+from tests.doors.cli.processes import LIMP, servobus, until
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
@@ -277,37 +201,3 @@ def test_a_line_that_is_lost_during_a_scan_does_not_lose_what_was_found(rig: str
             assert scan.returncode == 1
             assert [hit["id"] for hit in json.loads(out)] == [1, 2]
             assert "servobus: line: " in err
-
-
-def test_the_monitor_on_a_terminal_is_a_table_without_folds(rig: str, terminal: Terminal) -> None:
-    arguments = ("monitor", "-c", rig, "--count", "2", "--hz", "50")
-    with servobus(*arguments, stdout=terminal.end, NO_COLOR="1", TERM="xterm") as process:
-        picture = terminal.rest()
-        assert process.wait(20) == 0
-        row = next(line for line in picture.splitlines() if "arm/shoulder" in line)
-        assert row.split()[-2:] == ["online", "-"], row
-        assert "health" in picture
-
-
-def test_a_scan_on_a_terminal_shows_how_far_it_is_and_how_long_it_will_take(rig: str, terminal: Terminal) -> None:
-    with servobus("scan", "-c", rig, "--ids", "1-40", "--json", stderr=terminal.end, TERM="xterm") as process:
-        bar = terminal.rest()
-        assert process.stdout is not None
-        assert len(json.loads(process.stdout.read())) == 2
-        assert process.wait(20) == 0
-        assert "scanning" in bar
-        assert "2 found" in bar
-        assert "0:00:0" in bar
-
-
-@pytest.mark.parametrize(("no_color", "coloured"), [("", True), ("1", False)])
-def test_logs_on_a_terminal_are_for_people(rig: str, no_color: str, coloured: bool, terminal: Terminal) -> None:
-    with servobus("run", rig, "--log-every", "0.1", stderr=terminal.end, NO_COLOR=no_color) as process:
-        told = ""
-        while "state" not in told:
-            told += terminal.some()
-        process.terminate()
-        told += terminal.rest()
-        assert process.wait(10) == 0
-        assert "running" in told
-        assert ("\x1b[" in told) is coloured

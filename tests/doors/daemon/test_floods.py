@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from tests.config_mistakes import GOOD
-from tests.doors.cli.test_processes import servobus, until
+from tests.doors.cli.processes import servobus, until
 
 DESCRIPTORS = 64
 """What the daemon may open; a few are its own."""
