@@ -6,9 +6,9 @@ import os
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
-from servobus.doors.native.door import NativeDoor, open_door
+from servobus.doors.native.door import HANDSHAKE, NativeDoor, open_door
 from servobus.local import LocalRig
 
 
-def open_test_door(rig: LocalRig, path: Path) -> AbstractAsyncContextManager[NativeDoor]:
-    return open_door(rig, path, owner=os.geteuid())
+def open_test_door(rig: LocalRig, path: Path, *, handshake: float = HANDSHAKE) -> AbstractAsyncContextManager[NativeDoor]:
+    return open_door(rig, path, owner=os.geteuid(), handshake=handshake)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 
-from servobus.bus import health
 from servobus.config import Config
 from servobus.errors import ServobusError
 from servobus.local import LocalRig
@@ -22,12 +21,12 @@ from tests.virtual import virtual
 @dataclass(frozen=True)
 class Delivery:
     """What the line does to replies. `lossy`: a verb may end in a typed error. `patience`: seconds that an answer may take on a
-    machine that has no time for us; None where answers are lost (some drown in noise too): the usual."""
+    machine that has no time for us, beyond the usual; 0 where answers are lost (some drown in noise too)."""
 
     faults: str
     lossy: bool = False
     echo: str = "off"
-    patience: float | None = None
+    patience: float = 0.0
 
 
 MATRIX = {
@@ -129,8 +128,8 @@ LOSSY: dict[str, Callable[[Any], bool]] = {
 """What is right all the same where replies are lost: ids not found, goals that leave one by one, an older goal reached."""
 
 
-def _config(protocol: str, delivery: Delivery, **more: str) -> Config:
-    keys = {"faults": delivery.faults, "echo": delivery.echo, "poll": "{feedback: 50}", **more}
+def _config(protocol: str, delivery: Delivery) -> Config:
+    keys = {"faults": delivery.faults, "echo": delivery.echo, "poll": "{feedback: 50}"}
     if protocol == "sms":
         return config(**keys)
     servos, baudrate = {"kst": (KST_SERVOS, "512000"), "roh": (ROH_SERVOS, "115200")}[protocol]
@@ -165,11 +164,9 @@ async def test_in_memory(kind: str, protocol: str) -> None:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", MATRIX)
-async def test_on_a_pty(kind: str, protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    delivery, keys = MATRIX[kind], {}
-    if delivery.patience is not None:
-        monkeypatch.setattr(health, "FIRST_DEADLINE", delivery.patience)
-        monkeypatch.setattr(health, "LEAST_DEADLINE", delivery.patience)
-        keys = {"timeout_ms": f"{1000 * delivery.patience:g}"}
-    async with pty_rig(_config(protocol, delivery, **keys)) as rig:
+async def test_on_a_pty(kind: str, protocol: str) -> None:
+    delivery = MATRIX[kind]
+    async with pty_rig(_config(protocol, delivery)) as rig:
+        line = rig.buses["arm"].line
+        line.traits = replace(line.traits, latency=delivery.patience)
         await _every_verb(rig, protocol, delivery)

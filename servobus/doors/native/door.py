@@ -22,7 +22,6 @@ from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.local import LocalRig
 
 HANDSHAKE = 5.0
-"""Seconds for a TCP client to show its token, and before that for TLS."""
 CLOSING = 1.0
 """Seconds that clients get to leave at the end."""
 
@@ -30,12 +29,14 @@ log = structlog.get_logger("servobus")
 
 
 class NativeDoor:
-    """One rig, many clients. `owner`: the user whose daemon it is."""
+    """One rig, many clients. `owner`: the user whose daemon it is. `handshake`: seconds for a TCP client to show its token, and
+    before that for TLS."""
 
-    def __init__(self, rig: LocalRig, owner: int) -> None:
+    def __init__(self, rig: LocalRig, owner: int, *, handshake: float = HANDSHAKE) -> None:
         self.rig: LocalRig = rig
         self.options = rig.config.door
         self.owner = owner
+        self.handshake = handshake
         self.loop = asyncio.get_running_loop()
         self.now = self.loop.time
         self.work = Work(self.loop)
@@ -70,7 +71,7 @@ class NativeDoor:
             limit = self.options.clients_per_user
             return Overloaded(f"{limit} connections are yours already (door.clients_per_user): close one")
         if tcp:
-            self.loop.call_later(HANDSHAKE, self._late, client)
+            self.loop.call_later(self.handshake, self._late, client)
         return None
 
     def admit(self, client: Connection, token: str | None) -> Role:
@@ -112,7 +113,7 @@ class NativeDoor:
         self._tokens, context = Tokens(tcp), tls_context(tcp)
         try:
             build = partial(Connection, self, tcp=True)
-            patience = None if context is None else HANDSHAKE
+            patience = None if context is None else self.handshake
             server = await self.loop.create_server(
                 build, tcp.host, tcp.port, ssl=context, backlog=BACKLOG, ssl_handshake_timeout=patience
             )
@@ -141,11 +142,13 @@ class NativeDoor:
 
 
 @asynccontextmanager
-async def open_door(rig: LocalRig, path: Path, *, owner: int, listener: socket.socket | None = None) -> AsyncIterator[NativeDoor]:
-    """The door of `rig` at `path`, until the context ends. `listener`: that socket, where it was claimed already.
-    Raises ConfigError, PortBusy."""
+async def open_door(
+    rig: LocalRig, path: Path, *, owner: int, listener: socket.socket | None = None, handshake: float = HANDSHAKE
+) -> AsyncIterator[NativeDoor]:
+    """The door of `rig` at `path`, until the context ends. `listener`: that socket, where it was claimed already. `handshake`: as
+    NativeDoor has it. Raises ConfigError, PortBusy."""
     listener = claim(path) if listener is None else listener
-    door = NativeDoor(rig, owner)
+    door = NativeDoor(rig, owner, handshake=handshake)
     try:
         await door.listen(listener, path)
         yield door

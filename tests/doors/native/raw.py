@@ -13,7 +13,7 @@ from typing import Any
 
 from servobus.access import DoorOptions
 from servobus.config import Config
-from servobus.doors.native.door import NativeDoor
+from servobus.doors.native.door import HANDSHAKE, NativeDoor
 from servobus.local import LocalRig
 from servobus.opening import open_rig
 from tests.door import open_test_door
@@ -69,9 +69,11 @@ async def dialled(path: Path | str) -> AsyncIterator[Raw]:
 
 
 @asynccontextmanager
-async def served(folder: Path, setup: Config | None = None, **door: Any) -> AsyncIterator[tuple[LocalRig, NativeDoor, Path]]:
+async def served(
+    folder: Path, setup: Config | None = None, *, handshake: float = HANDSHAKE, **door: Any
+) -> AsyncIterator[tuple[LocalRig, NativeDoor, Path]]:
     """A rig behind its door; `door`: keys of `door:`."""
     path = folder / "servobus.sock"
     made = replace(setup or config(), door=DoorOptions(**door))
-    async with open_rig(made) as rig, open_test_door(rig, path) as native:
+    async with open_rig(made) as rig, open_test_door(rig, path, handshake=handshake) as native:
         yield rig, native, path

@@ -9,7 +9,6 @@ import pytest
 
 import servobus
 from servobus.access import TcpOptions, TlsOptions
-from servobus.doors.native import door as native
 from servobus.errors import AccessDenied, ConfigError
 from tests.doors.native.raw import served
 from tests.doors.native.test_access import TOKEN, token_file
@@ -37,12 +36,9 @@ async def test_a_rig_through_tls(tmp_path: Path, certificate: Certificate) -> No
 
 
 @pytest.mark.parametrize("secret", [False, True])
-async def test_who_says_nothing_is_not_kept(
-    secret: bool, tmp_path: Path, certificate: Certificate, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_who_says_nothing_is_not_kept(secret: bool, tmp_path: Path, certificate: Certificate) -> None:
     """Neither before the handshake of TLS nor before the token."""
-    monkeypatch.setattr(native, "HANDSHAKE", PATIENCE)
-    async with served(tmp_path, tcp=tcp(tmp_path, certificate if secret else None)) as (_, door, _):
+    async with served(tmp_path, handshake=PATIENCE, tcp=tcp(tmp_path, certificate if secret else None)) as (_, door, _):
         port = int(door.addresses[1].rpartition(":")[2])
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         async with asyncio.timeout(20):
