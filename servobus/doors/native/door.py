@@ -15,7 +15,7 @@ import structlog
 from servobus.access import Role
 from servobus.doors.native.connection import Connection
 from servobus.doors.native.leasing import Leasing
-from servobus.doors.native.listen import BACKLOG, Tokens, claim, peer_credentials, remove, tls_context
+from servobus.doors.native.listen import BACKLOG, Tokens, claim, inode, peer_credentials, remove, tls_context
 from servobus.doors.native.subscriptions import Subscriptions
 from servobus.doors.native.work import Work
 from servobus.errors import ConfigError, Overloaded, ServobusError
@@ -148,10 +148,11 @@ async def open_door(
     """The door of `rig` at `path`, until the context ends. `listener`: that socket, where it was claimed already. `handshake`: as
     NativeDoor has it. Raises ConfigError, PortBusy."""
     listener = claim(path) if listener is None else listener
+    own = inode(path)
     door = NativeDoor(rig, owner, handshake=handshake)
     try:
         await door.listen(listener, path)
         yield door
     finally:
         await door.close()
-        remove(path, listener)
+        remove(path, own)

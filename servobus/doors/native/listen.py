@@ -89,12 +89,19 @@ def _remove_stale(path: Path) -> None:
     raise PortBusy(f"a servobus daemon (pid {pid}) listens at {path} already: use it, stop it, or set SERVOBUS_SOCKET")
 
 
-def remove(path: Path, listener: socket.socket) -> None:
+def inode(path: Path) -> int | None:
+    """What tells the socket there from another that took its place; None: there is none."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_ino if stat.S_ISSOCK(found.st_mode) else None
+
+
+def remove(path: Path, own: int | None) -> None:
     """At the end; somebody else's socket stays."""
-    with suppress(OSError):
-        own = os.stat(path, follow_symlinks=False)
-        if stat.S_ISSOCK(own.st_mode) and listener.getsockname() == str(path):
-            path.unlink()
+    if own is not None and inode(path) == own:
+        path.unlink(missing_ok=True)
 
 
 class Tokens:

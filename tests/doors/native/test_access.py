@@ -275,5 +275,18 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
         claim(tmp_path / "run" / "s")
 
 
+@pytest.mark.parametrize("theirs", [False, True])
+async def test_at_the_end_its_own_socket_is_removed_and_no_other(theirs: bool, tmp_path: Path) -> None:
+    async with served(tmp_path) as (_, _, path):
+        assert path.exists()
+        if theirs:
+            (tmp_path / "kept").hardlink_to(path)  # so that its number is not given to the next
+            path.unlink()
+            other = socket.socket(socket.AF_UNIX)
+            other.bind(str(path))
+            other.close()
+    assert path.exists() is theirs
+
+
 def test_defaults_of_the_door() -> None:
     assert (DoorOptions().tcp, DoorOptions().clients, DoorOptions().lease_ms) == (None, 1000, 500)
