@@ -61,8 +61,8 @@ VERBS: dict[str, Verb] = {
         lambda results: results == {"arm/s1": Outcome.ACKED, "arm/s2": Outcome.ACKED},
     ),
     "settle": (
-        lambda rig: rig.settle("s1", "s2"),
-        lambda states: all(abs(abs(state.position) - 8) <= 1 for state in states.values()),
+        lambda rig: rig.settle("s1", "s2", tolerance=0.5),
+        lambda states: all(abs(abs(state.position) - 8) < 1 for state in states.values()),
     ),
     "disable": (lambda rig: rig.disable("s2"), lambda done: done is None),
     "stop": (lambda rig: rig.stop(), lambda reports: set(reports) == {"arm/s1", "arm/s2", "arm/s3"}),
@@ -111,8 +111,8 @@ ROH_VERBS: dict[str, Verb] = {
         lambda results: set(results.values()) == {Outcome.ACKED},
     ),
     "settle": (
-        lambda rig: rig.settle("s1", "s2"),
-        lambda states: all(abs(abs(state.position - 50) - 8) <= 1 for state in states.values()),
+        lambda rig: rig.settle("s1", "s2", tolerance=0.5),
+        lambda states: all(abs(abs(state.position - 50) - 8) < 1 for state in states.values()),
     ),
     "stop": VERBS["stop"],
     "clear": VERBS["clear"],

@@ -1,4 +1,4 @@
-"""The bus master on a line that does what the test says: turn-taking, lateness, echo, babble, e-stop between frames, the plug."""
+"""The bus master on a line that does what the test says: turn-taking, lateness, echo, babble, e-stop between frames."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ async def test_disable_that_does_not_read_back_is_an_error_and_it_is_disabled_fo
 
 
 @virtual
-async def test_disable_waits_for_no_exclusive_session() -> None:
+async def test_disable_is_refused_in_an_exclusive_session() -> None:
     async with puppet_bus() as (bus, puppet, _, _), bus.exclusive():
         puppet.heard.clear()
         with pytest.raises(LeaseHeld, match="arm/s1"):

@@ -22,6 +22,7 @@ from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.local import LocalRig
 
 HANDSHAKE = 5.0
+"""Seconds."""
 CLOSING = 1.0
 """Seconds that clients get to leave at the end."""
 

@@ -1,4 +1,4 @@
-"""The simulated hand by itself, and what is done to a hand once."""
+"""The simulated hand by itself."""
 
 from __future__ import annotations
 
