@@ -28,15 +28,15 @@ from servobus.errors import (
     ServobusError,
     UnknownName,
 )
-from servobus.events import Event
-from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
-from servobus.rig import Found, Reload, Rig, Servo, Snapshot
+from servobus.rig.events import Event
+from servobus.rig.interface import Found, Reload, Rig, Servo, Snapshot
+from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
 
 if TYPE_CHECKING:
     from servobus import blocking
-    from servobus.client import RemoteRig, connect
-    from servobus.local import LocalRig
-    from servobus.opening import open_rig as open
+    from servobus.remote.rig import RemoteRig, connect
+    from servobus.rig.local import LocalRig
+    from servobus.rig.opening import open_rig as open
 
 __all__ = [
     "AccessDenied",
@@ -79,11 +79,11 @@ __all__ = [
 ]
 
 _LATER = {
-    "LocalRig": ("servobus.local", "LocalRig"),
-    "RemoteRig": ("servobus.client", "RemoteRig"),
+    "LocalRig": ("servobus.rig.local", "LocalRig"),
+    "RemoteRig": ("servobus.remote.rig", "RemoteRig"),
     "blocking": ("servobus.blocking", None),
-    "connect": ("servobus.client", "connect"),
-    "open": ("servobus.opening", "open_rig"),
+    "connect": ("servobus.remote.rig", "connect"),
+    "open": ("servobus.rig.opening", "open_rig"),
 }
 
 

@@ -1,5 +1,5 @@
 """python -m servobus."""
 
-from servobus.doors.cli import main
+from servobus.cli import main
 
 main()

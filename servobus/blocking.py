@@ -16,13 +16,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 
-from servobus import client
 from servobus.errors import LinkDown
-from servobus.events import Event
-from servobus.rig import Rig, Servo, Snapshot
+from servobus.remote import rig as client
+from servobus.rig.events import Event
+from servobus.rig.interface import Rig, Servo, Snapshot
 
 if TYPE_CHECKING:
-    from servobus.config import Config
+    from servobus.config.loader import Config
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -247,6 +247,6 @@ connect = _waiting(client.connect)
 
 def open(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
     """A rig whose ports this process owns: `servobus.open`."""
-    from servobus.opening import open_rig  # the engine, which a client does without
+    from servobus.rig.opening import open_rig  # the engine, which a client does without
 
     return _waiting(open_rig)(config, buses=buses, degraded=degraded)

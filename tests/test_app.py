@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from servobus.config import parse_config
+from servobus.config.loader import parse_config
 from servobus.errors import EStopped, LimitError, NotEnabled
-from servobus.opening import open_rig
-from servobus.protocols.words import Outcome
-from tests.virtual import virtual
+from servobus.rig.opening import open_rig
+from servobus.values import Outcome
+from tests.virtual_time import virtual
 
 KEYS = "limits: [-45, 45], max_speed: 90"
 JOINTS = {

@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from servobus import blocking
-from servobus.client import connect
 from servobus.errors import LimitError, LinkDown, UnknownName
-from servobus.protocols.words import Goal, Outcome, State
-from servobus.rig import Rig, Servo
-from tests.puppet_daemon import STATE, PuppetDaemon, puppet_daemon
-from tests.rigs import config
+from servobus.remote.rig import connect
+from servobus.rig.interface import Rig, Servo
+from servobus.values import Goal, Outcome, State
+from tests.scripted_daemon import STATE, PuppetDaemon, puppet_daemon
+from tests.simulated_rigs import config
 
 ACKED = {"result": {"arm/s1": "acked"}}
 

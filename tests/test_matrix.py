@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from servobus.config import Config
+from servobus.config.loader import Config
 from servobus.errors import ServobusError
-from servobus.local import LocalRig
-from servobus.opening import open_rig
-from servobus.protocols.words import Outcome
-from tests.rigs import config, pty_rig
-from tests.virtual import virtual
+from servobus.rig.local import LocalRig
+from servobus.rig.opening import open_rig
+from servobus.values import Outcome
+from tests.simulated_rigs import config, pty_rig
+from tests.virtual_time import virtual
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from servobus.errors import LimitError
 from servobus.protocols.options import ServoOptions
-from servobus.protocols.words import GOAL_NUMBERS, Goal, is_number, no_number
+from servobus.values import GOAL_NUMBERS, Goal, is_number, no_number
 
 
 def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:

@@ -13,14 +13,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
-from servobus.bus.line import HALF_AGAIN, QUIET, Line
-from servobus.bus.queue import Job
-from servobus.bus.runner import Runner
-from servobus.bus.turn import Turn, judge
+from servobus.engine.engine import Runner
+from servobus.engine.line import HALF_AGAIN, QUIET, Line
+from servobus.engine.queue import Job
+from servobus.engine.turn import Turn, judge
 from servobus.errors import LinkDown
 from servobus.links.base import Transport
 from servobus.protocols.base import Codec, Reply, Request
-from servobus.timerfd import CoarseTimer, FineTimer, clock_of
+from servobus.timers import CoarseTimer, FineTimer, clock_of
 
 CLOSE_TIMEOUT = 0.5
 """Seconds for the last bytes to leave."""

@@ -14,13 +14,13 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from servobus.bus.coalescer import Ticket
-from servobus.bus.health import Condition, Node
 from servobus.bus.limits import check_goal
-from servobus.bus.queue import Job
-from servobus.bus.record import ServoRecord
+from servobus.bus.records import ServoRecord
+from servobus.engine.coalescer import Ticket
+from servobus.engine.health import Condition, Node
+from servobus.engine.queue import Job
 from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError
-from servobus.protocols.words import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
+from servobus.values import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
 
 if TYPE_CHECKING:
     from servobus.bus.service import BusService

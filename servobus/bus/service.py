@@ -11,21 +11,21 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar, cast
 
-from servobus.bus.health import Condition, Health, Node
-from servobus.bus.introduction import Introduction
-from servobus.bus.line import EchoFilter, Line
+from servobus.bus.discovery import Introduction
 from servobus.bus.master import BusMaster
 from servobus.bus.motion import Motion
-from servobus.bus.queue import TRIES, Job
-from servobus.bus.record import ServoRecord
-from servobus.bus.runner import Runner
-from servobus.bus.scheduler import Scheduler
-from servobus.bus.stats import BusStats
+from servobus.bus.records import ServoRecord
+from servobus.engine.engine import Runner
+from servobus.engine.health import Condition, Health, Node
+from servobus.engine.line import EchoFilter, Line
+from servobus.engine.queue import TRIES, Job
+from servobus.engine.scheduler import Scheduler
+from servobus.engine.stats import BusStats
 from servobus.errors import DeviceError, LeaseHeld, NotSupported, ServobusError
 from servobus.protocols.base import Codec, Commissioning, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
-from servobus.protocols.words import Identity, State, Update
-from servobus.timerfd import clock_of
+from servobus.timers import clock_of
+from servobus.values import Identity, State, Update
 
 R = TypeVar("R")
 

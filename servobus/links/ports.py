@@ -10,7 +10,7 @@ from pathlib import Path
 from serial.tools import list_ports as serial_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from servobus.links.device import find_holder
+from servobus.links.tty import find_holder
 
 LINK_FOLDERS = (Path("/dev/serial/by-id"), Path("/dev/serial/by-path"))
 """Where udev puts names that stay the same whatever is plugged in first."""

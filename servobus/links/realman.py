@@ -16,7 +16,7 @@ from servobus.protocols.base import LineTraits
 from servobus.protocols.modbus.codec import BROADCAST, Frame, ModbusCodec
 from servobus.protocols.realman import codec
 from servobus.protocols.realman.codec import Dialect, Lines, Message, Step
-from servobus.protocols.realman.question import Question
+from servobus.protocols.realman.requests import Question
 
 LATENCY = 0.020
 """Seconds an arm takes for one command, at the least."""

@@ -18,7 +18,7 @@ import serial.rs485
 from serial_asyncio import SerialTransport
 
 from servobus.errors import LinkDown
-from servobus.links.device import check_device, explain, is_pty
+from servobus.links.tty import check_device, explain, is_pty
 from servobus.protocols.base import LineTraits
 
 CHUNK = 4096

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 from servobus.errors import DeviceError, ServobusError
-from servobus.protocols.words import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from servobus.errors import LimitError, NotSupported, UnknownName
-from servobus.protocols.words import is_number
+from servobus.values import is_number
 
 T = TypeVar("T")
 Pair = Annotated[tuple[T, T], BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)]

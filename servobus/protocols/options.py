@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from servobus.protocols.model import Data, Pair, ServoModel
-from servobus.protocols.words import Calibration
+from servobus.values import Calibration
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 StopKind = Literal["hold", "limp", "park"]

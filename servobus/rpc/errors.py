@@ -9,7 +9,7 @@ from typing import Any
 
 from servobus import errors
 from servobus.errors import DeviceError, PartialFailure, ServobusError
-from servobus.protocols.words import Outcome
+from servobus.values import Outcome
 
 PARSE, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL = -32700, -32600, -32601, -32602, -32603
 FAILED = -32000

@@ -10,9 +10,8 @@ from typing import Any
 
 import msgspec
 
-from servobus.protocols.words import Change, Goal, Identity, Outcome, State, StopReport
-from servobus.rig import Found, Reload
-from servobus.roles import Role
+from servobus.rig.interface import Found, Reload
+from servobus.values import Change, Goal, Identity, Outcome, Role, State, StopReport
 
 PROTOCOL = 1
 """Of these messages: a client of another one is told so at `hello`."""

@@ -11,7 +11,7 @@ import pytest
 from servobus.bus.limits import check_goal
 from servobus.errors import LimitError
 from servobus.protocols.options import ServoOptions
-from servobus.protocols.words import Goal
+from servobus.values import Goal
 
 PLAIN = ServoOptions(id=1)
 NEXT = 1e-9

@@ -10,8 +10,8 @@ import pytest
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction, encode
-from tests.bus.puppet import Answers, puppet_bus
-from tests.virtual import virtual
+from tests.engine.scripted_line import Answers, puppet_bus
+from tests.virtual_time import virtual
 
 FENCE = 5
 """Address from which a fence reads."""

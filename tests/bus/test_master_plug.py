@@ -6,10 +6,10 @@ import asyncio
 
 import pytest
 
-from servobus.bus.queue import Job
+from servobus.engine.queue import Job
 from servobus.errors import LinkDown, Overloaded
-from tests.bus.puppet import puppet_bus
-from tests.virtual import virtual
+from tests.engine.scripted_line import puppet_bus
+from tests.virtual_time import virtual
 
 # The plug
 

@@ -11,9 +11,9 @@ import pytest
 
 from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
-from servobus.protocols.words import Goal, Outcome
-from tests.bus.puppet import Answers, puppet_bus
-from tests.virtual import virtual
+from servobus.values import Goal, Outcome
+from tests.engine.scripted_line import Answers, puppet_bus
+from tests.virtual_time import virtual
 
 PARKED = "s1: {id: 1, model: sts, on_estop: park, park_pose: 10, park_timeout: 0.5}"
 

@@ -11,8 +11,8 @@ from servobus.bus.scan import scan
 from servobus.errors import LinkDown, NotSupported
 from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction
-from tests.bus.puppet import Answers, puppet_bus
-from tests.virtual import virtual
+from tests.engine.scripted_line import Answers, puppet_bus
+from tests.virtual_time import virtual
 
 
 @virtual

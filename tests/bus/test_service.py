@@ -8,8 +8,8 @@ import pytest
 
 from servobus.errors import EStopped, LeaseHeld, LinkDown, NotSupported, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
-from tests.bus.puppet import puppet_bus
-from tests.virtual import virtual
+from tests.engine.scripted_line import puppet_bus
+from tests.virtual_time import virtual
 
 
 @virtual

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import crowd, daemon, faults, kst, line, slow, turns
+from tests.campaigns import crowd, daemon, dead_servo, faults, kst_bench, slow_hand, turns_bench
 from tests.campaigns.oracle import ORACLES
 
 
@@ -34,13 +34,13 @@ def soak_cancel(count: int) -> bool:
 
 
 def soak_hand(_: int) -> bool:
-    result = slow.slow_hand(10_000)
+    result = slow_hand.slow_hand(10_000)
     result.report("roh: a hand slower than the deadline, 10 000 reads of changing registers")
     return not (result.wrong or result.hung or result.leaked or result.waiting)
 
 
 def soak_line(_: int) -> bool:
-    figures = line.main()
+    figures = dead_servo.main()
     return (
         figures.rate_with_dead >= 0.8 * figures.rate_before
         and figures.unplug < 0.05
@@ -50,13 +50,13 @@ def soak_line(_: int) -> bool:
 
 
 def bench_turns(_: int) -> bool:
-    ratios = turns.main()
+    ratios = turns_bench.main()
     best = ratios["servobus, 12 callers, uvloop"]
     return best >= 0.45 and best > ratios["feetech-servo-sdk"]
 
 
 def bench_kst(_: int) -> bool:
-    return min(kst.main().values()) >= 0.9
+    return min(kst_bench.main().values()) >= 0.9
 
 
 def soak_kill(_: int) -> bool:

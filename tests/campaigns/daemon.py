@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic, perf_counter, sleep
 
-from servobus.doors.cli.common import loop_factory
-from tests.campaigns.turns import spin
+from servobus.cli.output import loop_factory
+from tests.campaigns.turns_bench import spin
 
 RIG = """version: 1
 door: {rate: null, clients: 5000, clients_per_user: 5000}
@@ -103,10 +103,10 @@ def kills(times: int, seed: int = 1) -> Killed:
 
 async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
     """On a simulated line of a process of its own, which sees what is written at each start."""
-    from servobus.config import parse_config
+    from servobus.config.loader import parse_config
     from servobus.links.base import FarEnd
-    from servobus.sim.build import far_end, simulated_line
-    from servobus.sim.pty import SimPty
+    from servobus.simulation.build import far_end, simulated_line
+    from servobus.simulation.pty import SimPty
 
     loop, result = asyncio.get_running_loop(), Killed()
     setup = parse_config(RIG % '"sim:"' + SERVOS, "campaign")

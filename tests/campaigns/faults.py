@@ -16,7 +16,7 @@ from servobus.bus.service import PATIENCE, BusService
 from servobus.errors import ServobusError
 from servobus.protocols.options import FaultOptions
 from tests.campaigns.oracle import SERVOS, Oracle, service
-from tests.virtual import VirtualLoop
+from tests.virtual_time import VirtualLoop
 
 KINDS = ("loss", "late", "duplicate", "truncate", "drop_byte", "insert_byte", "flip", "wrong_id", "echo")
 LATE_MS = 100.0

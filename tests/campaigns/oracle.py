@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from servobus.bus.service import BusService
-from servobus.config import parse_config
+from servobus.config.loader import parse_config
 from servobus.links.base import Link
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
@@ -25,9 +25,9 @@ from servobus.protocols.kst.codec import encode as kst_encode
 from servobus.protocols.modbus.codec import Function, ModbusCodec, pack, words
 from servobus.protocols.modbus.codec import encode as modbus_encode
 from servobus.protocols.options import FaultOptions
+from servobus.protocols.registry import PROTOCOLS
 from servobus.protocols.sms.codec import Instruction, SmsCodec
 from servobus.protocols.sms.codec import encode as sms_encode
-from servobus.protocols.table import PROTOCOLS
 
 SERVOS = 10
 NUMBERS = 1 << 16

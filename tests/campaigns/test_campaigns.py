@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from tests.campaigns import faults, line, slow
+from tests.campaigns import dead_servo, faults, slow_hand
 from tests.campaigns.faults import KINDS, Result
 from tests.campaigns.oracle import ORACLES
 
@@ -50,14 +50,14 @@ def test_every_kind_of_fault_is_in() -> None:
 
 
 def test_a_dead_servo_and_a_pulled_plug() -> None:
-    figures = line.main(0.2)
+    figures = dead_servo.main(0.2)
     assert figures.rate_with_dead > 0
-    assert figures.unplug_errors == line.SERVOS - 1
+    assert figures.unplug_errors == dead_servo.SERVOS - 1
     assert figures.replug > 0
 
 
 def test_a_hand_slower_than_the_deadline() -> None:
-    result = slow.slow_hand(1000)
+    result = slow_hand.slow_hand(1000)
     assert_right(result)
     assert result.reads > 200
     assert result.timeouts > 50

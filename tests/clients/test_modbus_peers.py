@@ -15,10 +15,10 @@ from pymodbus.client import ModbusSerialClient
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from servobus.config import parse_config
-from servobus.opening import open_rig
-from servobus.protocols.words import Outcome
-from tests.clients.served import served
+from servobus.config.loader import parse_config
+from servobus.rig.opening import open_rig
+from servobus.values import Outcome
+from tests.clients.bus_process import served
 
 HAND = """\
 version: 1

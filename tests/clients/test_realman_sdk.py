@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.clients.served import served
+from tests.clients.bus_process import served
 
 sdk: Any = pytest.importorskip("Robotic_Arm.rm_robot_interface", reason="the vendor's Robotic_Arm is not installed")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import rustypot
 
-from tests.clients.served import served
+from tests.clients.bus_process import served
 
 STS3215 = 777
 IDS = [1, 2, 3]

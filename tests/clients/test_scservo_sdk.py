@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import scservo_sdk
 
-from tests.clients.served import served
+from tests.clients.bus_process import served
 
 GOAL_POSITION, PRESENT_POSITION, LOCK, ID, MOVING, TORQUE = 42, 56, 55, 5, 66, 40
 STS3215 = 777

@@ -12,7 +12,7 @@ import pytest
 
 from servobus.links.faulty import LONGEST_PIECE, MOST_NOISE, FaultyEnd
 from servobus.protocols.options import FaultOptions
-from tests.virtual import virtual
+from tests.virtual_time import virtual
 
 FRAME = b"\x01abcdefgh"
 RUNS = 200

@@ -10,8 +10,8 @@ import pytest
 from servobus.errors import LinkDown, PortBusy, PortMissing
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
-from tests.links.ear import Ear
-from tests.virtual import virtual
+from tests.links.recorder import Ear
+from tests.virtual_time import virtual
 
 TRAITS = LineTraits(9_600, can_change_baud=True)
 

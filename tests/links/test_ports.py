@@ -8,7 +8,7 @@ from pathlib import Path
 from serial.tools.list_ports_common import ListPortInfo
 
 from servobus.links.ports import PortInfo, describe, links_in, list_ports
-from tests.links.pty import plugged
+from tests.links.bare_pty import plugged
 
 
 def test_links_that_lead_to_a_port(tmp_path: Path) -> None:

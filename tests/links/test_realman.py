@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from servobus.config import Config, parse_config
+from servobus.config.loader import Config, parse_config
 from servobus.errors import ConfigError, DeviceError, LinkDown, ServobusError
 from servobus.links import open_link
-from servobus.local import LocalRig
-from servobus.opening import open_rig
 from servobus.protocols.roh import ENTRY
-from servobus.protocols.roh.device import RohDevice
-from servobus.protocols.words import Outcome
-from servobus.sim.arm import ArmFaults, ArmServer
+from servobus.protocols.roh.simulated.device import RohDevice
+from servobus.rig.local import LocalRig
+from servobus.rig.opening import open_rig
+from servobus.simulation.arm import ArmFaults, ArmServer
+from servobus.values import Outcome
 
 FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
 GENERATIONS = pytest.mark.parametrize("generation", [2, 3, 4])

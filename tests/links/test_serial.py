@@ -15,8 +15,8 @@ import pytest
 from servobus.errors import LinkDown
 from servobus.links.serial import MOST_UNSENT, UART_LATENCY, USB_LATENCY, SerialLink
 from servobus.protocols.base import LineTraits
-from tests.links.ear import Ear, on_each_loop
-from tests.links.pty import plugged
+from tests.links.bare_pty import plugged
+from tests.links.recorder import Ear, on_each_loop
 
 ODD_RATES = (76_800, 128_000, 250_000, 256_000, 512_000)
 

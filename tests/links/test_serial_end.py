@@ -9,8 +9,8 @@ import pytest
 
 from servobus.errors import LinkDown
 from servobus.links.serial import MOST_UNSENT, DirectTransport, SerialLink
-from tests.links.ear import Ear, on_each_loop
-from tests.links.pty import Pty, plugged
+from tests.links.bare_pty import Pty, plugged
+from tests.links.recorder import Ear, on_each_loop
 
 
 async def filled(pty: Pty, ear: Ear) -> tuple[DirectTransport, bytes]:

@@ -14,7 +14,7 @@ import pytest
 from servobus.errors import LinkDown
 from servobus.links.tcp import LATENCY, TcpLink, explain
 from servobus.protocols.base import LineTraits
-from tests.links.ear import PATIENCE, Ear, on_each_loop
+from tests.links.recorder import PATIENCE, Ear, on_each_loop
 
 
 class Server:

@@ -9,7 +9,7 @@ import pytest
 
 from servobus.errors import LinkDown, ReplyTimeout
 from servobus.protocols.base import LineTraits, Plan, Request, ask, run_plan
-from servobus.protocols.table import PROTOCOLS
+from servobus.protocols.registry import PROTOCOLS
 
 
 class Number(Request[int]):

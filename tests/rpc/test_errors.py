@@ -9,8 +9,8 @@ import pytest
 
 from servobus.errors import DeviceError, GoalExpired, NotSupported, PartialFailure, ServobusError
 from servobus.protocols.kst.aborts import AccessRefused, HardwareFault
-from servobus.protocols.words import Outcome
 from servobus.rpc.errors import FAILED, INTERNAL, INVALID_PARAMS, NO_METHOD, TYPES, decoded, encoded
+from servobus.values import Outcome
 
 
 def through(error: ServobusError) -> Exception:

@@ -7,10 +7,9 @@ import inspect
 import msgspec
 import pytest
 
-from servobus.protocols.words import Outcome, State
-from servobus.rig import Rig, Servo
-from servobus.roles import Role
+from servobus.rig.interface import Rig, Servo
 from servobus.rpc.methods import METHODS, Method, WriteRegister, needed_role
+from servobus.values import Outcome, Role, State
 
 LOCAL = {"events", "watch", "full_name", "full_names", "send"}
 """What a client makes of other methods: subscriptions, names it knows, and `send_all` of one."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from servobus.protocols.entry import ProtocolEntry
+from servobus.protocols.definition import ProtocolEntry
 from servobus.protocols.kst.codec import KstCodec, node_of, rename
-from servobus.protocols.kst.device import devices
 from servobus.protocols.kst.driver import KstDriver
-from servobus.protocols.kst.load import load_models
+from servobus.protocols.kst.model_loading import load_models
 from servobus.protocols.kst.options import KstBus
+from servobus.protocols.kst.simulated.device import devices
 
 
 def codec(options: KstBus | None = None) -> KstCodec:

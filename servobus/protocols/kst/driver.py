@@ -15,12 +15,12 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout,
 from servobus.protocols.base import GoalTurn, PlainDriver, Plan, Poll, Request, ask
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
-from servobus.protocols.kst.commission import Commissioning
+from servobus.protocols.kst.commissioning import Commissioning
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
 from servobus.protocols.kst.requests import Fence, Read, Wire
 from servobus.protocols.kst.servo import FittedServo
-from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
 FENCES = (Command.READ_ID, Command.READ_VERSION, Command.READ_STATUS, Command.READ_POSITION)
 """The reads there are; a fence is one whose reply is not under way. The first names the servo in its data too."""

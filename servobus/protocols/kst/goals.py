@@ -14,7 +14,7 @@ from servobus.protocols.kst.aborts import HardwareFault
 from servobus.protocols.kst.codec import Command, encode_position
 from servobus.protocols.kst.requests import Confirmed, Read, Tell, Wire
 from servobus.protocols.kst.servo import FittedServo
-from servobus.protocols.words import Outcome, StopReport, StopTarget
+from servobus.values import Outcome, StopReport, StopTarget
 
 TIMES = 2
 """What is not answered is said twice, because a lossy line may swallow one."""

@@ -15,7 +15,7 @@ from servobus.errors import DeviceError, ReplyTimeout
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import FACTORY_ID, Command, decode_position, version_text
 from servobus.protocols.kst.requests import Read, Wire
-from servobus.protocols.words import Identity
+from servobus.values import Identity
 
 R = TypeVar("R")
 

@@ -11,7 +11,7 @@ from servobus.errors import DeviceError, LimitError
 from servobus.protocols.kst.codec import decode_position
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstServo
-from servobus.protocols.words import Update
+from servobus.values import Update
 
 JUMP_DEG = 5.0
 """How far off its way a servo may be before it must have restarted: more than load and overshoot explain."""

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from servobus.protocols.entry import ProtocolEntry
+from servobus.protocols.definition import ProtocolEntry
 from servobus.protocols.modbus.codec import MAX_UNIT, ModbusCodec, node_of, rename
-from servobus.protocols.roh.device import devices
 from servobus.protocols.roh.driver import RohDriver
-from servobus.protocols.roh.load import load_models
 from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.model_loading import load_models
 from servobus.protocols.roh.options import RohBus
+from servobus.protocols.roh.simulated.device import devices
 
 
 def codec(options: RohBus | None) -> ModbusCodec:

@@ -17,14 +17,14 @@ from servobus.protocols.base import GoalTurn, LineTraits, Plan, Poll, Request, a
 from servobus.protocols.modbus.codec import MAX_UNIT, Function
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, Probe, Wire
 from servobus.protocols.roh import goals, stop
-from servobus.protocols.roh.commission import Commissioning
+from servobus.protocols.roh.commissioning import Commissioning
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import FIRST, Hand, identity
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.options import MAPS, RohBus
 from servobus.protocols.roh.registers import NamedWrite, named_write, read_named
 from servobus.protocols.roh.spans import Limits, Span, read_spans
-from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
 TOLD = range(1, 10)
 """Fences of so many registers begin where the map is told; behind them stand registers that can only be written."""

@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from servobus.errors import LimitError, NotSupported
-from servobus.protocols.roh.load import channel_number
 from servobus.protocols.roh.model import FULL, RohModel, RohRegister
+from servobus.protocols.roh.model_loading import channel_number
 from servobus.protocols.roh.options import RohServo
 from servobus.protocols.roh.spans import Span, cut
-from servobus.protocols.words import ServoGoal, Update, is_number
+from servobus.values import ServoGoal, Update, is_number
 
 BY_UNIT = {"%": ("pos_target", "pos"), "deg": ("angle_target", "angle")}
 """Unit of a finger -> registers of where it shall go and where it is."""

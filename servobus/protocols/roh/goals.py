@@ -15,7 +15,7 @@ from servobus.protocols.base import GoalTurn, Plan, ask
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import Hand
 from servobus.protocols.roh.spans import write_spans
-from servobus.protocols.words import Outcome, ServoGoal
+from servobus.values import Outcome, ServoGoal
 
 Results = dict[str, Outcome | Exception]
 Failures = dict[Finger, ServobusError]

@@ -13,11 +13,11 @@ from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Plan, Request, ask
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, ReadHolding, Wire, WriteMultiple, WriteSingle
 from servobus.protocols.roh.finger import Finger
-from servobus.protocols.roh.load import NEWEST
 from servobus.protocols.roh.model import RohModel
+from servobus.protocols.roh.model_loading import NEWEST
 from servobus.protocols.roh.options import MAPS
 from servobus.protocols.roh.spans import Limits, Span, read_spans
-from servobus.protocols.words import Identity, Update
+from servobus.values import Identity, Update
 
 R = TypeVar("R")
 

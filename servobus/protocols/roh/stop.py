@@ -16,7 +16,7 @@ from servobus.protocols.roh.goals import Word, write_words
 from servobus.protocols.roh.hand import Hand
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.spans import write_spans
-from servobus.protocols.words import StopReport, StopTarget
+from servobus.values import StopReport, StopTarget
 
 TIMES = 2
 """What is not answered is said twice, because a lossy line may swallow one."""

@@ -1,11 +1,11 @@
 """FEETECH SMS 1.0 and its relatives (STS, SCS): the seed's instruction packets on RS485 or TTL."""
 
-from servobus.protocols.entry import ProtocolEntry
+from servobus.protocols.definition import ProtocolEntry
 from servobus.protocols.sms.codec import MAX_ID, SmsCodec, node_of, rename
-from servobus.protocols.sms.device import devices
 from servobus.protocols.sms.driver import SmsDriver
-from servobus.protocols.sms.load import load_models
+from servobus.protocols.sms.model_loading import load_models
 from servobus.protocols.sms.options import SmsBus
+from servobus.protocols.sms.simulated.device import devices
 
 
 def codec(options: SmsBus | None) -> SmsCodec:

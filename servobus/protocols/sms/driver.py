@@ -19,7 +19,7 @@ from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Fence, Ping, Read, SyncRead, Write
 from servobus.protocols.sms.servo import FittedServo
 from servobus.protocols.sms.stop import Stopper
-from servobus.protocols.words import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
 FENCE_SIZES = range(3, 27)
 """Never two parameters: the echo of any READ has two."""

@@ -15,7 +15,7 @@ from servobus.protocols.sms.codec import OVERHEAD
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Action, Read, RegWrite, SyncWrite, Write, sync_write_size
 from servobus.protocols.sms.servo import FittedServo
-from servobus.protocols.words import Outcome, ServoGoal
+from servobus.values import Outcome, ServoGoal
 
 MAX_FRAME_SECONDS = 0.010
 """No frame holds the line longer than this, so that an e-stop never waits longer."""

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 from servobus.errors import NotSupported
 from servobus.protocols.base import Plan, ask
-from servobus.protocols.sms.load import packaged_models
 from servobus.protocols.sms.model import SmsModel
+from servobus.protocols.sms.model_loading import packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read
 from servobus.protocols.sms.servo import FittedServo
-from servobus.protocols.words import GoalKind, Identity
+from servobus.values import GoalKind, Identity
 
 BIG_ENDIAN = 1
 """Address 2, END: 0 little, 1 big."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from servobus.protocols.model import Data, Pair, Register, ServoModel
-from servobus.protocols.words import GoalKind
+from servobus.values import GoalKind
 
 StateField = Literal["position", "goal", "speed", "load", "current", "voltage", "temperature", "moving", "status"]
 LAST_ADDRESS = 255

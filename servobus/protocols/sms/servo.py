@@ -10,7 +10,7 @@ from servobus.errors import LimitError, NotSupported
 from servobus.protocols.model import Register
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
-from servobus.protocols.words import GoalKind, ServoGoal, Update, is_number
+from servobus.values import GoalKind, ServoGoal, Update, is_number
 
 BY_CALIBRATION = frozenset({"position", "speed", "acceleration"})
 """Units of registers that the servo's calibration turns into its own unit."""

@@ -17,7 +17,7 @@ from servobus.protocols.sms.goals import split_sync_write
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read, Write
 from servobus.protocols.sms.servo import FittedServo
-from servobus.protocols.words import StopReport, StopTarget
+from servobus.values import StopReport, StopTarget
 
 ROUNDS = 3
 TIMES = 2

@@ -16,14 +16,14 @@ from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.kst import ENTRY
-from servobus.protocols.kst.commission import Commissioning
-from servobus.protocols.kst.device import KstDevice
+from servobus.protocols.kst.commissioning import Commissioning
 from servobus.protocols.kst.driver import KstDriver
+from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.protocols.options import FaultOptions
-from servobus.protocols.words import Goal, Outcome
-from servobus.sim.line import SimLine
-from tests.protocols.kst.simulated import bus_options
-from tests.virtual import virtual
+from servobus.simulation.line import SimLine
+from servobus.values import Goal, Outcome
+from tests.protocols.kst.bench import bus_options
+from tests.virtual_time import virtual
 
 FAULTS = {
     "whole": FaultOptions(),

@@ -24,7 +24,7 @@ from servobus.protocols.kst.codec import (
     rename,
     version_text,
 )
-from tests.protocols.kst.simulated import frame_of, steady
+from tests.protocols.kst.bench import frame_of, steady
 
 READ = encode(0x25, Command.READ_POSITION)
 REPLY = encode(0x25, 0x59, encode_position(-109))

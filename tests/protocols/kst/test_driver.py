@@ -10,8 +10,8 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout,
 from servobus.protocols.base import Driver, run_plan
 from servobus.protocols.kst.codec import Command, encode
 from servobus.protocols.kst.driver import KstDriver
-from servobus.protocols.words import Goal, ServoGoal
-from tests.protocols.kst.simulated import Bench, changed_model, goal
+from servobus.values import Goal, ServoGoal
+from tests.protocols.kst.bench import Bench, changed_model, goal
 
 
 def test_it_is_a_driver() -> None:

@@ -10,8 +10,8 @@ from servobus.errors import EchoMismatch, ReplyTimeout
 from servobus.protocols.kst.aborts import HardwareFault, OutOfRange
 from servobus.protocols.kst.codec import Command, encode, encode_position
 from servobus.protocols.kst.goals import HOLDS
-from servobus.protocols.words import Outcome, StopReport, StopTarget
-from tests.protocols.kst.simulated import Bench, changed_model, goal
+from servobus.values import Outcome, StopReport, StopTarget
+from tests.protocols.kst.bench import Bench, changed_model, goal
 
 
 def position_frame(node: int, steps: int) -> bytes:

@@ -7,7 +7,7 @@ import pytest
 from servobus.errors import ReplyTimeout
 from servobus.protocols.kst.codec import FACTORY_ID, Command
 from servobus.protocols.kst.identity import LOOKS, STILL
-from tests.protocols.kst.simulated import Bench, device_of
+from tests.protocols.kst.bench import Bench, device_of
 
 
 def factory_bench() -> Bench:

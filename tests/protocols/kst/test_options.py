@@ -11,9 +11,9 @@ from pydantic import ValidationError
 from servobus.errors import ConfigError
 from servobus.protocols.kst import codec
 from servobus.protocols.kst.codec import BAUD_TABLE, encode
-from servobus.protocols.kst.load import FILES, load_models, packaged_model
+from servobus.protocols.kst.model_loading import FILES, load_models, packaged_model
 from servobus.protocols.kst.requests import TURNAROUND, Wire
-from tests.protocols.kst.simulated import bus_options, changed_model
+from tests.protocols.kst.bench import bus_options, changed_model
 
 
 def refusal(**keys: Any) -> str:

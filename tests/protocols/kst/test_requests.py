@@ -11,7 +11,7 @@ from servobus.protocols.base import Request
 from servobus.protocols.kst.aborts import AbortReader, OutOfRange
 from servobus.protocols.kst.codec import Command, decode_position, encode, encode_position
 from servobus.protocols.kst.requests import Broadcast, Confirmed, Fence, Read, Save, Tell, Wire
-from tests.protocols.kst.simulated import bus_options, frame_of
+from tests.protocols.kst.bench import bus_options, frame_of
 
 WIRE = Wire()
 

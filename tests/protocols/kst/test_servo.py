@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from servobus.errors import DeviceError, LimitError
 from servobus.protocols.kst.codec import encode_position
-from servobus.protocols.kst.load import packaged_model
+from servobus.protocols.kst.model_loading import packaged_model
 from servobus.protocols.kst.options import KstServo
 from servobus.protocols.kst.servo import FittedServo
-from tests.protocols.kst.simulated import steady
+from tests.protocols.kst.bench import steady
 
 
 def fitted(**options: Any) -> FittedServo:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from servobus.bus.load import wire_load
+from servobus.bus.bandwidth import wire_load
 from servobus.bus.service import BusService
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.links.faulty import FaultyEnd
@@ -18,11 +18,11 @@ from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.options import FaultOptions
 from servobus.protocols.roh import ENTRY
-from servobus.protocols.roh.device import RohDevice
-from servobus.protocols.words import Goal, Outcome
-from servobus.sim.line import SimLine
-from tests.protocols.roh.simulated import HAND, bus_options
-from tests.virtual import virtual
+from servobus.protocols.roh.simulated.device import RohDevice
+from servobus.simulation.line import SimLine
+from servobus.values import Goal, Outcome
+from tests.protocols.roh.bench import HAND, bus_options
+from tests.virtual_time import virtual
 
 FAULTS = {
     "whole": FaultOptions(),

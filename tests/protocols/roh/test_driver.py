@@ -11,8 +11,8 @@ from servobus.protocols.base import Driver
 from servobus.protocols.modbus.codec import pack, reply_key
 from servobus.protocols.roh.driver import LONGEST_FENCE, fence_count
 from servobus.protocols.roh.model import CHANNELS
-from servobus.protocols.words import Identity
-from tests.protocols.roh.simulated import Bench, bench_of, goal
+from servobus.values import Identity
+from tests.protocols.roh.bench import Bench, bench_of, goal
 
 MAPS = pytest.mark.parametrize("name", ["legacy", "v1", "v2"])
 READ = 3

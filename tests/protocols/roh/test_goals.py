@@ -12,8 +12,8 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
 from servobus.protocols.base import run_plan
 from servobus.protocols.roh.model import CHANNELS
 from servobus.protocols.roh.spans import Span, read_spans, write_spans
-from servobus.protocols.words import ServoGoal, StopTarget
-from tests.protocols.roh.simulated import HAND, THREE, Bench, all_fingers, goal, three_hands
+from servobus.values import ServoGoal, StopTarget
+from tests.protocols.roh.bench import HAND, THREE, Bench, all_fingers, goal, three_hands
 
 TARGETS = {"legacy": 1125, "v1": 1135, "v2": 1135}
 

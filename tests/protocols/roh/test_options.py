@@ -11,9 +11,9 @@ from pydantic import ValidationError
 from servobus.errors import ConfigError, LimitError, UnknownName
 from servobus.protocols.base import LineTraits
 from servobus.protocols.roh import ENTRY
-from servobus.protocols.roh.load import FILES, load_models, packaged_models
 from servobus.protocols.roh.model import CHANNELS, RohModel
-from tests.protocols.roh.simulated import HAND, bus_options
+from servobus.protocols.roh.model_loading import FILES, load_models, packaged_models
+from tests.protocols.roh.bench import HAND, bus_options
 
 INDEX = HAND["index"]
 

@@ -10,7 +10,7 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout,
 from servobus.protocols.base import LineTraits, run_plan
 from servobus.protocols.modbus.requests import WriteSingle
 from servobus.protocols.roh.model import CHANNELS
-from tests.protocols.roh.simulated import Bench, bench_of, goal
+from tests.protocols.roh.bench import Bench, bench_of, goal
 
 MAPS = pytest.mark.parametrize("name", ["legacy", "v1", "v2"])
 READ = 3

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from servobus.protocols.roh.model import CHANNELS
-from servobus.protocols.words import StopTarget
-from tests.protocols.roh.simulated import Bench, all_fingers, three_hands
+from servobus.values import StopTarget
+from tests.protocols.roh.bench import Bench, all_fingers, three_hands
 
 
 def target(servo: str, *, kind: Any = "hold", enabled: bool = True, **how: Any) -> StopTarget:

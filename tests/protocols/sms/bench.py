@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.sms.codec import Instruction, Packet
-from servobus.protocols.sms.device import SmsDevice, devices
 from servobus.protocols.sms.driver import SmsDriver
-from servobus.protocols.sms.load import packaged_models
 from servobus.protocols.sms.model import SmsModel
+from servobus.protocols.sms.model_loading import packaged_models
 from servobus.protocols.sms.options import SmsBus
-from servobus.protocols.words import Goal, Outcome, ServoGoal
-from tests.protocols.sms.simulated import packet_of
+from servobus.protocols.sms.simulated.device import SmsDevice, devices
+from servobus.values import Goal, Outcome, ServoGoal
+from tests.protocols.sms.single_servo import packet_of
 
 R = TypeVar("R")
 Results = dict[str, Outcome | Exception]

@@ -7,7 +7,7 @@ import pytest
 from servobus.errors import DeviceError, NotSupported, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.driver import FENCE_SIZES, fence_size
-from servobus.protocols.words import Goal, ServoGoal
+from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench, meddle
 
 LOCK, DELAY = 55, 7

@@ -6,9 +6,9 @@ import pytest
 
 from servobus.errors import LimitError, NotSupported
 from servobus.protocols.sms.model import SmsModel
-from servobus.protocols.words import Goal, ServoGoal
+from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench
-from tests.protocols.sms.simulated import changed, model_of
+from tests.protocols.sms.single_servo import changed, model_of
 
 # What a goal says
 

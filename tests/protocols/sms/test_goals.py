@@ -7,7 +7,7 @@ import pytest
 from servobus.errors import ActionWithheld, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, Packet
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
-from servobus.protocols.words import Goal, Outcome, ServoGoal
+from servobus.values import Goal, Outcome, ServoGoal
 from tests.protocols.sms.bench import TWO, Bench
 
 MANY = {f"s{number}": {"id": number, "model": "sts"} for number in range(1, 41)}

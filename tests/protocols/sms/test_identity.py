@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from servobus.protocols.sms.codec import Instruction
-from servobus.protocols.words import Identity
+from servobus.values import Identity
 from tests.protocols.sms.bench import Bench
 
 

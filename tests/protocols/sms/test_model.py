@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from servobus.protocols.sms.model import SmsModel
-from tests.protocols.sms.simulated import FAMILIES, changed, model_of
+from tests.protocols.sms.single_servo import FAMILIES, changed, model_of
 
 
 def with_keys(**keys: Any) -> SmsModel:

@@ -9,7 +9,7 @@ import pytest
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.requests import Read, SyncRead
-from servobus.protocols.words import Goal, ServoGoal
+from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import TWO, Bench
 
 LOCK, DELAY = 55, 7

@@ -22,7 +22,7 @@ from servobus.protocols.sms.requests import (
     Write,
     sync_write_size,
 )
-from tests.protocols.sms.simulated import packet_of
+from tests.protocols.sms.single_servo import packet_of
 
 
 def reply(servo: int, params: bytes = b"", status: int = 0) -> Packet:

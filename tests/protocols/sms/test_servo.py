@@ -12,8 +12,8 @@ from servobus.errors import LimitError, NotSupported
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
 from servobus.protocols.sms.servo import FittedServo
-from servobus.protocols.words import Goal, ServoGoal
-from tests.protocols.sms.simulated import FAMILIES, model_of
+from servobus.values import Goal, ServoGoal
+from tests.protocols.sms.single_servo import FAMILIES, model_of
 
 STEP = 360 / 4096
 

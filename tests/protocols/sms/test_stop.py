@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from servobus.protocols.sms.codec import Instruction
-from servobus.protocols.words import Goal, StopReport, StopTarget
+from servobus.values import Goal, StopReport, StopTarget
 from tests.protocols.sms.bench import TWO, Bench, meddle
 
 

@@ -1,0 +1,105 @@
+"""The daemon: a rig and its door, as the system's service sees them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from contextlib import suppress
+from pathlib import Path
+
+import anyio
+import structlog
+
+from servobus.daemon.notify import Notifier
+from servobus.daemon.server import NativeDoor, open_door
+from servobus.daemon.sockets import claim
+from servobus.daemon.watchdog import Pulse, Watchdog
+from servobus.errors import ServobusError
+from servobus.rig.local import LocalRig
+from servobus.rig.opening import open_rig
+
+LOOKS = 3
+"""Looks at the buses within the time that the system's watchdog allows."""
+
+log = structlog.get_logger("servobus")
+
+
+async def serve_rig(config: str, path: Path, log_every: float) -> None:
+    """Until it is cancelled. The socket is claimed before a port is opened: a second daemon disturbs nobody. Raises ConfigError,
+    PortBusy."""
+    notifier, listener = Notifier(), claim(path)
+    async with (
+        open_rig(config, degraded=True) as rig,
+        open_door(rig, path, owner=os.geteuid(), listener=listener) as door,
+        anyio.create_task_group() as group,
+    ):
+        log.info("running", config=config, buses=list(rig.buses), doors=door.addresses, pid=os.getpid())
+        notifier.ready(f"{len(rig.buses)} buses, {len(rig.names)} servos")
+        reloads = asyncio.Event()
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)
+        group.start_soon(_reload, rig, door, notifier, reloads)
+        group.start_soon(_log_states, rig, log_every)
+        if notifier.watchdog is not None:
+            group.start_soon(_feed, rig, notifier, notifier.watchdog / LOOKS)
+        try:
+            await anyio.sleep_forever()
+        finally:
+            notifier.stopping()
+
+
+async def _reload(rig: LocalRig, door: NativeDoor, notifier: Notifier, asked: asyncio.Event) -> None:
+    """SIGHUP. A file that is wrong changes nothing, and is told."""
+    while True:
+        await asked.wait()
+        asked.clear()
+        notifier.reloading()
+        try:
+            await rig.reload()
+            door.leasing.reloaded()
+        except ServobusError as error:
+            log.error("reload_refused", reason=str(error))
+        notifier.ready(f"{len(rig.buses)} buses, {len(rig.names)} servos")
+
+
+async def _feed(rig: LocalRig, notifier: Notifier, period: float) -> None:
+    """The system's watchdog, as long as every bus goes on."""
+    watchdog = Watchdog()
+    while True:
+        stuck = watchdog.stuck({name: _pulse(rig, name) for name in rig.buses})
+        if stuck:
+            log.error("bus_stuck", buses=stuck)
+        else:
+            notifier.alive()
+        await anyio.sleep(period)
+
+
+def _pulse(rig: LocalRig, name: str) -> Pulse:
+    bus = rig.buses[name]
+    counts = bus.stats.counts
+    return Pulse(bus.master.up, counts["frames"], counts["bytes_heard"], bus.scheduler.waiting())
+
+
+async def _log_states(rig: LocalRig, every: float) -> None:
+    while True:
+        await anyio.sleep(every)
+        with suppress(KeyError):  # a bus that a reload is just taking away
+            _log_state(rig)
+
+
+def _log_state(rig: LocalRig) -> None:
+    """One line for each bus."""
+    stats, snapshot = rig.stats(), rig.snapshot()
+    for bus, counts in stats.items():
+        servos = {name.partition("/")[2]: state for name, state in snapshot.items() if rig.names[name][0] == bus}
+        log.info(
+            "state",
+            bus=bus,
+            up=counts["up"],
+            load_percent=counts["wire_load_percent"],
+            turn_p99_ms=counts["turn_ms"]["p99"],
+            timeouts=counts.get("timeouts", 0),
+            positions={name: state.position for name, state in servos.items()},
+            not_online=[name for name, state in servos.items() if state.health != "online"],
+            faults={name: list(state.faults) for name, state in servos.items() if state.faults},
+        )

@@ -1,0 +1,177 @@
+"""Who wants to be told what, and how often. One timer for all; the latest value wins.
+
+Points of the grid are spread over the period, and each servo's state is written out at most once for all who want it at a moment.
+A client that does not read is passed over, and told how much it missed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+from typing import TYPE_CHECKING
+
+from servobus.daemon.jsonrpc import encode, notification
+from servobus.errors import NotSupported, Overloaded, UnknownName
+from servobus.rig.events import Event
+from servobus.rig.local import LocalRig
+from servobus.rpc.methods import LEAST_HZ, MAX_SUBSCRIPTIONS, MOST_HZ, Subscribe
+from servobus.values import State
+
+if TYPE_CHECKING:
+    from servobus.daemon.connection import Connection
+
+TOPICS = ("state", "events", "stats")
+FIELDS = frozenset(State.__dataclass_fields__)
+SAME_MOMENT = 0.004
+"""Seconds for which what was written out is good for another subscription."""
+SHARE = 64
+"""Subscriptions served in one pass of the loop."""
+SPREAD = 0.618
+
+
+class Subscription:
+    """`missed` counts what its client did not get."""
+
+    __slots__ = ("client", "due", "fields", "id", "missed", "names", "period", "topic")
+
+    def __init__(self, number: int, client: Connection, params: Subscribe, names: tuple[str, ...], due: float) -> None:
+        self.id = number
+        self.client: Connection | None = client
+        self.topic = params.topic
+        self.names = names
+        self.fields = params.fields
+        self.period = 1 / params.hz
+        self.due = due
+        self.missed = 0
+
+    def __lt__(self, other: Subscription) -> bool:
+        return self.due < other.due
+
+
+class Subscriptions:
+    """All of one door."""
+
+    def __init__(self, rig: LocalRig) -> None:
+        self._rig = rig
+        self._loop = asyncio.get_running_loop()
+        self._numbers = itertools.count(1)
+        self._phase = 0.0
+        self._heap: list[Subscription] = []
+        self._of: dict[Connection, dict[int, Subscription]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        """Kept here: a timer of uvloop that is due already does not say when."""
+        self._written: dict[str, bytes] = {}
+        self._written_at = -1.0
+        self._unlisten = rig.announcer.listen(self._event)
+
+    def add(self, client: Connection, params: Subscribe) -> int:
+        """Raises NotSupported, UnknownName, Overloaded."""
+        if params.topic not in TOPICS:
+            raise NotSupported(f"no topic {params.topic!r}: there are {', '.join(TOPICS)}")
+        if not LEAST_HZ <= params.hz <= MOST_HZ:
+            raise NotSupported(f"{params.hz:g} Hz is outside {LEAST_HZ:g} to {MOST_HZ:g}")
+        if unknown := set(params.fields) - FIELDS:
+            raise UnknownName(f"no field {', '.join(sorted(unknown))}: there are {', '.join(State.__dataclass_fields__)}")
+        mine = self._of.setdefault(client, {})
+        if len(mine) >= MAX_SUBSCRIPTIONS:
+            raise Overloaded(f"{MAX_SUBSCRIPTIONS} subscriptions are enough for one connection: unsubscribe from one")
+        names = tuple(self._rig.full_names(params.names)) if params.names else ()
+        self._phase = (self._phase + SPREAD) % 1
+        due = self._loop.time() + self._phase / params.hz
+        added = Subscription(next(self._numbers), client, params, names, due)
+        mine[added.id] = added
+        if added.topic != "events":
+            heapq.heappush(self._heap, added)
+            self._arm()
+        return added.id
+
+    def remove(self, client: Connection, number: int) -> None:
+        """Raises UnknownName."""
+        found = self._of.get(client, {}).pop(number, None)
+        if found is None:
+            raise UnknownName(f"no subscription {number} on this connection")
+        found.client = None
+
+    def gone(self, client: Connection) -> None:
+        for subscription in self._of.pop(client, {}).values():
+            subscription.client = None
+
+    def has(self, client: Connection) -> bool:
+        return bool(self._of.get(client))
+
+    def close(self) -> None:
+        self._unlisten()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _arm(self) -> None:
+        if self._heap and (self._timer is None or self._timer_at > self._heap[0].due):
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer_at = self._heap[0].due
+            self._timer = self._loop.call_at(self._timer_at, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        now = self._loop.time()
+        for _ in range(SHARE):
+            if not self._heap or self._heap[0].due > now:
+                break
+            subscription = heapq.heappop(self._heap)
+            if subscription.client is None:
+                continue
+            late = now - subscription.due
+            steps = max(1.0, late // subscription.period + 1)  # the next point of the grid that has not passed
+            subscription.due += steps * subscription.period
+            heapq.heappush(self._heap, subscription)
+            self._send(subscription, subscription.client, int(steps) - 1, now)
+        self._arm()
+
+    def _send(self, subscription: Subscription, client: Connection, skipped: int, now: float) -> None:
+        subscription.missed += skipped
+        if client.blocked:
+            subscription.missed += 1
+            return
+        head = b'{"subscription":%d,"missed":%d,' % (subscription.id, subscription.missed)
+        if subscription.topic == "stats":
+            body = b'"stats":%b}' % encode(self._rig.stats())
+        else:
+            body = b'"stopped":%b,"states":%b}' % (encode(self._rig.stopped), self._states(subscription, now))
+        subscription.missed = 0
+        client.write(notification(subscription.topic, head + body))
+
+    def _states(self, subscription: Subscription, now: float) -> bytes:
+        names = [name for name in subscription.names or self._rig.names if name in self._rig.names]
+        if subscription.fields:
+            states = ((name, self._rig.state(name)) for name in names)
+            return encode({name: {key: getattr(state, key) for key in subscription.fields} for name, state in states})
+        if now - self._written_at > SAME_MOMENT:
+            self._written.clear()
+            self._written_at = now
+        return b"{%b}" % b",".join(map(self._write, names))
+
+    def _write(self, name: str) -> bytes:
+        found = self._written.get(name)
+        if found is None:
+            found = self._written[name] = b"%b:%b" % (encode(name), encode(self._rig.state(name)))
+        return found
+
+    def _event(self, event: Event) -> None:
+        for client, mine in self._of.items():
+            for subscription in mine.values():
+                if subscription.topic != "events":
+                    continue
+                if client.blocked:
+                    subscription.missed += 1
+                    continue
+                params = {
+                    "subscription": subscription.id,
+                    "missed": subscription.missed,
+                    "name": event.name,
+                    "time": event.time,
+                    "fields": event.fields,
+                }
+                subscription.missed = 0
+                client.write(notification("event", encode(params)))

@@ -1,0 +1,107 @@
+"""A simulated ROH hand on its line: the seed's section 3 from the other end.
+
+Where the documents are silent it does this, and each can be changed by an attribute at any time: a write of several registers
+stops at the first that is refused, and keeps those before; broadcasts are obeyed and not answered; a new unit is obeyed after the
+answer, and a restart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from servobus.protocols.base import DeviceReply
+from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame, Function, encode, pack, words
+from servobus.protocols.roh.model import RohModel
+from servobus.protocols.roh.model_loading import NEWEST
+from servobus.protocols.roh.options import RohBus
+from servobus.protocols.roh.simulated.hand import HandBody, Refusal
+
+DELAY = 0.002
+"""Seconds from question to answer; no document names one."""
+ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
+
+
+class RohDevice(HandBody):
+    """One hand on the line."""
+
+    def __init__(self, model: RohModel, unit: int = 2, *, baudrate: int = 115_200) -> None:
+        super().__init__(model, unit)
+        self.baudrate = baudrate
+        self.delay = DELAY
+        self.extra_delay = 0.0
+        """Seconds that its answers come too late."""
+        self._due = -math.inf
+        self.dead = False
+        """Hears and says nothing."""
+        self.obeys_broadcasts = True
+        self.answers_broadcasts = False
+        self.answers_restart = True
+        """It answers the write that makes it restart."""
+        self.max_registers = MAX_READ
+
+    def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
+        """Obey a question, and answer it where the rules of the protocol say so."""
+        everybody = packet.unit == BROADCAST
+        if not (everybody or packet.unit == self.node) or self.dead or now < self._awake or self.state == "update":
+            return ()
+        if everybody and (not self.obeys_broadcasts or packet.function == Function.READ_HOLDING):
+            return ()
+        self.advance(now)
+        unit, awake = self.node, self._awake
+        try:
+            answer = encode(unit, packet.function, self._obey(packet))
+        except Refusal as refusal:
+            if refusal.sub:
+                self._put("sub_exception", 0, refusal.sub)
+            answer = encode(unit, packet.function | REFUSED, bytes((refusal.code,)))
+        restarted = self._awake != awake or self.state == "update"
+        if (everybody and not self.answers_broadcasts) or (restarted and not self.answers_restart):
+            return ()
+        # One after the other: a late answer is not overtaken by the next.
+        self._due = max(self._due, now + self.extra_delay)
+        return (DeviceReply(answer, self.delay, late=self._due - now),)
+
+    # Questions
+
+    def _obey(self, packet: Frame) -> bytes:
+        verb = VERBS.get(packet.function)
+        if verb is None:
+            raise Refusal(ILLEGAL_FUNCTION)
+        return verb(self, packet.body)
+
+    def read(self, body: bytes) -> bytes:
+        address, count = words(body)
+        self._require_count(count)
+        found = pack([self.look(place) for place in range(address, address + count)])
+        return bytes((len(found),)) + found
+
+    def write_single(self, body: bytes) -> bytes:
+        address, word = words(body)
+        self.write(address, word)
+        return body
+
+    def write_multiple(self, body: bytes) -> bytes:
+        address, count = words(body[:4])
+        self._require_count(count)
+        for place, word in enumerate(words(body[5:]), address):
+            self.write(place, word)
+        return body[:4]
+
+    def _require_count(self, count: int) -> None:
+        if not 1 <= count <= self.max_registers:
+            raise Refusal(ILLEGAL_VALUE)
+
+
+VERBS: dict[int, Callable[[RohDevice, bytes], bytes]] = {
+    Function.READ_HOLDING: RohDevice.read,
+    Function.WRITE_SINGLE: RohDevice.write_single,
+    Function.WRITE_MULTIPLE: RohDevice.write_multiple,
+}
+
+
+def devices(options: RohBus, models: Mapping[str, RohModel]) -> list[RohDevice]:
+    """The hands of a line, open; one whose map is not pinned has the newest."""
+    units = dict.fromkeys(servo.id for servo in options.servos.values())
+    maps = {unit: options.map_of(unit) for unit in units}
+    return [RohDevice(models[NEWEST if name == "auto" else name], unit, baudrate=options.baudrate) for unit, name in maps.items()]

@@ -1,0 +1,195 @@
+"""What is inside a simulated FEETECH servo: a memory table and a joint, and how each moves the other (feetech.md, 2, 3, 9).
+
+Where the documents are silent or contradict each other, it does this:
+- torque 128 stores the offset that makes this position 2048, whatever the lock says; goal and torque stay as they were;
+- a goal outside the stored angle limits ends at the limit, and the goal register keeps what was written;
+- both limits 0 mean many turns: no limit, and the position counts on past one turn;
+- modes that are neither position nor wheel (PWM, step), and torque 2 (damping), leave the joint at rest;
+- after a restart the goal register is 0 (the table's default), so torque without a goal first goes there;
+- RESET puts all EEPROM but the id back to factory values, for good, needs no unlock, and leaves RAM alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from servobus.protocols.sms.codec import MAX_ID, MAX_PARAMETERS
+from servobus.protocols.sms.model import SmsModel
+from servobus.protocols.sms.simulated.joint import Joint
+from servobus.protocols.sms.simulated.registers import SIZE, MemoryTable
+
+TORQUE_ON, CALIBRATE = 1, 128
+MIDDLE = 2048
+"""The position that CALIBRATE gives to where the servo stands."""
+AMPERES_AT_FULL_LOAD = 2.0
+SETTINGS = ("torque_limit", "max_torque", "min_angle_limit", "max_angle_limit", "mode", "position_offset")
+"""Beside goal, torque and wheel registers, these have a say in what the joint does."""
+
+
+class ServoBody:
+    """Registers and joint of one servo. Plain attributes may be set at any time: `faults`, `voltage`, `joint.stuck`."""
+
+    def __init__(self, model: SmsModel, servo_id: int, *, baudrate: int, position: int | None, response_level: int) -> None:
+        self.model = model
+        self.node = servo_id
+        self.baudrate = baudrate
+        self.voltage = 12.0
+        self.faults = 0
+        """The health byte (feetech.md, section 6): in each answer and in register 65."""
+        self.memory = MemoryTable(model)
+        self._registers = self.memory.registers
+        self._offset = 0
+        start = float(model.zero if position is None else position) % model.steps_per_turn
+        self.joint = Joint(model.steps_per_turn, model.max_steps_per_second, start, start)
+        self._live = [(self._registers[name], measure) for name, measure in LIVE.items() if name in self._registers]
+        self._steering = self._mark_steering()
+        self._rates = dict(self._registers["baud_rate"].values)
+        self._configure(baudrate, response_level)
+        self._wake()
+
+    def look(self, address: int, size: int, now: float) -> bytes:
+        """What a READ brings. What the servo measures is measured now."""
+        end = address + size
+        for register, measure in self._live:
+            if register.address < end and register.end > address:
+                self.joint.advance(now)
+                self.memory.put(register, round(measure(self) / register.scale))
+        return self.memory.read(address, min(size, MAX_PARAMETERS))
+
+    def apply(self, address: int, data: bytes, now: float) -> None:
+        """A WRITE that takes effect now. Writing the goal position switches torque on by itself."""
+        self.joint.advance(now)
+        end = min(SIZE, address + len(data))
+        torque, goal = self._registers[self.model.torque], self._registers[self.model.goal[0]]
+        before = self.memory.get(torque)
+        self.memory.write(address, data)
+        if self.memory.get(torque) == CALIBRATE:
+            self.memory.put(torque, before)
+            self._calibrate()
+        if address < goal.end and end > goal.address:
+            self.memory.put(torque, TORQUE_ON)
+        if address <= self._registers["baud_rate"].address:
+            self._adopt()
+        if any(self._steering[address:end]):
+            self._steer()
+
+    def reset(self, now: float) -> None:
+        """Factory values."""
+        self.joint.advance(now)
+        self.memory.reset(self._registers["id"])
+        self._adopt()
+        self._steer()
+
+    def restart(self, now: float) -> None:
+        """Power off and on: the joint stays where it is, what was not stored is lost, turns are no longer counted."""
+        self.joint.advance(now)
+        self.joint.position %= self.joint.turn
+        self.memory.restart()
+        self._wake()
+
+    def get(self, name: str) -> int:
+        """Raw value; 0 where this model has no such register."""
+        register = self._registers.get(name)
+        return self.memory.get(register) if register else 0
+
+    # What measurements are made of
+
+    def reported(self) -> float:
+        position = round(self.joint.position)
+        return position % self.joint.turn if self.joint.wraps else position
+
+    def load(self) -> float:
+        """Percent, at most the torque limit."""
+        most = self._torque_limit() / 1000
+        return 100 * max(-most, min(most, self.joint.load))
+
+    # From registers to the joint
+
+    def _steer(self) -> None:
+        """Make the joint do what the registers say now."""
+        joint, wheel = self.joint, self._is_wheel()
+        offset = self.get("position_offset")
+        joint.position += self._offset - offset
+        self._offset = offset
+        limits = self.get("min_angle_limit"), self.get("max_angle_limit")
+        joint.wheel, joint.wraps = wheel, wheel or limits != (0, 0)
+        if joint.wraps:
+            joint.position %= joint.turn
+        goal = self.get(self.model.goal[0])
+        joint.target = goal if limits == (0, 0) else max(limits[0], min(limits[1], goal))
+        joint.driven = self.get(self.model.torque) == TORQUE_ON and self._torque_limit() > 0 and (wheel or not self.get("mode"))
+        joint.rate = self._pace(wheel)
+
+    def _pace(self, wheel: bool) -> float:
+        """Steps/s. Speed 0 is rest for a wheel; else the time word rules, where the model has one, or nothing limits it."""
+        fastest = self.joint.fastest
+        time, speed = (self._registers[name] for name in self.model.goal[1:3])
+        rate = self.memory.get(speed) * speed.scale
+        if wheel:
+            return max(-fastest, min(fastest, rate))
+        if rate:
+            return min(fastest, abs(rate))
+        milliseconds = self.memory.get(time) if self.model.time_is_ms else 0
+        way = abs(self.joint.target - self.joint.position)
+        return min(fastest, 1000 * way / milliseconds) if milliseconds else fastest
+
+    def _is_wheel(self) -> bool:
+        wheel = self.model.wheel
+        return wheel is not None and all(self.get(name) == value for name, value in wheel.registers.items())
+
+    def _torque_limit(self) -> int:
+        """0.1 %."""
+        return self.get("torque_limit" if "torque_limit" in self._registers else "max_torque")
+
+    def _calibrate(self) -> None:
+        register = self._registers.get("position_offset")
+        if register:
+            half = self.joint.turn // 2
+            offset = round(self.joint.position) + self._offset - MIDDLE
+            self.memory.store(register, (offset + half) % (2 * half) - half)
+
+    def _mark_steering(self) -> bytes:
+        marks = bytearray(SIZE)
+        wheel = self.model.wheel.registers if self.model.wheel else {}
+        for name in (*self.model.goal, self.model.torque, *SETTINGS, *wheel):
+            if register := self._registers.get(name):
+                marks[register.address : register.end] = b"\1" * register.size
+        return bytes(marks)
+
+    # Id and baud rate
+
+    def _configure(self, baudrate: int, response_level: int) -> None:
+        """What somebody stored before. A rate that has no code takes the place of the factory's."""
+        register = self._registers["baud_rate"]
+        codes = [code for code, rate in self._rates.items() if rate == baudrate]
+        code = codes[0] if codes else register.default or 0
+        self._rates[code] = baudrate
+        for name, raw in (("id", self.node), ("baud_rate", code), ("response_status_level", response_level)):
+            self.memory.store(self._registers[name], raw)
+
+    def _adopt(self) -> None:
+        """Be called as the registers say, at once; what is no id or no baud code changes nothing."""
+        if (servo_id := self.get("id")) <= MAX_ID:
+            self.node = servo_id
+        self.memory.put(self._registers["id"], self.node)
+        self.baudrate = int(self._rates.get(self.get("baud_rate"), self.baudrate))
+
+    def _wake(self) -> None:
+        if "torque_limit" in self._registers:
+            self.memory.put(self._registers["torque_limit"], self.get("max_torque"))
+        self._adopt()
+        self._steer()
+
+
+LIVE: dict[str, Callable[[ServoBody], float]] = {
+    "present_position": ServoBody.reported,
+    "present_speed": lambda body: body.joint.velocity,
+    "present_load": ServoBody.load,
+    "present_voltage": lambda body: body.voltage,
+    "present_temperature": lambda body: body.joint.temperature,
+    "servo_status": lambda body: body.faults,
+    "moving": lambda body: body.joint.velocity != 0,
+    "present_goal_position": lambda body: body.joint.target,
+    "present_current": lambda body: abs(body.load()) / 100 * AMPERES_AT_FULL_LOAD,
+}
+"""Registers that are measured when they are read, in physical units."""

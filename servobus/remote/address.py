@@ -1,0 +1,103 @@
+"""How a client reaches a daemon: its address, the token, TLS, and what to tell a person when nobody is there."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from servobus.errors import AccessDenied, ConfigError, LinkDown
+from servobus.remote.connection import Wire
+from servobus.rpc.socket_path import find_socket, socket_path
+
+CONNECT_TIMEOUT = 5.0
+"""Seconds until the connection stands, and again until the daemon has said who it is."""
+MAX_TOKEN = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A Unix socket, or a host and port."""
+
+    path: Path | None = None
+    host: str = ""
+    port: int = 0
+    tls: ssl.SSLContext | None = None
+
+    def __str__(self) -> str:
+        return str(self.path) if self.path else f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+
+    async def dial(self, wire: Callable[[], Wire]) -> Wire:
+        """A connection. Raises LinkDown, AccessDenied."""
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(CONNECT_TIMEOUT):
+                if self.path:
+                    return (await loop.create_unix_connection(wire, str(self.path)))[1]
+                return (await loop.create_connection(wire, self.host, self.port, ssl=self.tls))[1]
+        except PermissionError:
+            raise AccessDenied(f"{self}: this user may not open the socket: become a member of its group") from None
+        except ssl.SSLError as error:
+            raise LinkDown(f"{self}: no TLS with the daemon ({error.reason or error}): check its certificate and `tls`") from None
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise LinkDown(f"no daemon listens at {self}: start it: servobus run CONFIG") from None
+        except TimeoutError:
+            raise LinkDown(f"{self} does not take the connection within {CONNECT_TIMEOUT:g} s: is its daemon stopped?") from None
+        except OSError as error:
+            raise LinkDown(f"{self}: {error.strerror or error}: check the address, or start it: servobus run CONFIG") from None
+
+
+def address_of(place: str | Path | None, tls: bool | str | Path | ssl.SSLContext) -> Address:
+    """What a person writes. Raises ConfigError."""
+    text = str((find_socket() or socket_path()) if place is None else place)
+    if "://" not in text:
+        if tls:
+            raise ConfigError(f"{text}: a Unix socket has no TLS: leave `tls` away, or connect to tcp://host:port")
+        return Address(Path(text))
+    try:
+        url = urlsplit(text)
+        host, port = url.hostname, url.port
+    except ValueError as error:
+        raise ConfigError(f"{text}: {error}: write tcp://host:port") from None
+    if url.scheme != "tcp" or not host or not port or url.path or url.query or url.username:
+        raise ConfigError(f"{text} is no address of a daemon: write the path of its socket, or tcp://host:port")
+    if not tls and not _this_machine(host):
+        raise ConfigError(f"{text} is another machine, and the token would be readable on the way: give tls=True or its CA file")
+    return Address(host=host, port=port, tls=_context(tls) if tls else None)
+
+
+def _this_machine(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _context(tls: bool | str | Path | ssl.SSLContext) -> ssl.SSLContext:
+    if isinstance(tls, ssl.SSLContext):
+        return tls
+    try:
+        return ssl.create_default_context(cafile=None if tls is True else str(tls))
+    except (OSError, ssl.SSLError) as error:
+        raise ConfigError(f"{tls}: no certificates in it ({error}): give the PEM file that the daemon's is signed by") from None
+
+
+def token_of(token: str | None, token_file: str | Path | None) -> str | None:
+    """Read anew at each connection, so that a token may change. Raises ConfigError."""
+    if token is not None and token_file is not None:
+        raise ConfigError("give a token or a token_file, not both")
+    if token_file is None:
+        return token
+    try:
+        with Path(token_file).open("rb") as file:
+            text = file.read(MAX_TOKEN + 1).decode("ascii").strip()
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not ASCII text"
+        raise ConfigError(f"{token_file}: {reason}: give the daemon's token file, readable for you") from None
+    if not text or len(text) > MAX_TOKEN:
+        raise ConfigError(f"{token_file}: no token in it: give the daemon's token file")
+    return text

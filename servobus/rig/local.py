@@ -1,0 +1,296 @@
+"""LocalRig: the rig whose ports this process owns. What becomes of one bus stands in `keeper.py`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+import structlog
+from anyio.abc import TaskGroup
+
+from servobus.bus.scan import scan
+from servobus.bus.service import BusService
+from servobus.config.loader import Config, load_config
+from servobus.errors import EStopped, LeaseHeld, LimitError, NotSupported, UnknownName
+from servobus.protocols.registry import PROTOCOLS
+from servobus.rig.events import Announcer, Event
+from servobus.rig.interface import Found, Reload, Rig, Snapshot
+from servobus.rig.results import outcomes, raise_failures
+from servobus.rig.supervisor import Keeper, Trace
+from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
+
+R = TypeVar("R")
+QUIET = frozenset({"line_up", "echo_probed", "estop_cleared", "servo_online", "reloaded"})
+"""Events that are no reason to look."""
+
+log = structlog.get_logger("servobus")
+
+
+class LocalRig(Rig):
+    """Made by `servobus.open`, and alive as long as that context."""
+
+    def __init__(
+        self, config: Config, keepers: TaskGroup, only: Collection[str] = (), trace: Trace | None = None, path: Path | None = None
+    ) -> None:
+        self.config = config
+        self.path = path
+        """The file `reload` reads; None: there is none."""
+        self.left: dict[str, StopReport] = {}
+        """What became of each servo that was still enabled at the end, by full name; filled when the context has ended."""
+        self.announcer = Announcer()
+        self._only = only
+        self._trace = trace
+        self._group = keepers
+        self._stopping: set[asyncio.Task[Any]] = set()
+        self._reloading: asyncio.Task[Reload] | None = None
+        self.keepers = {name: self._keeper(name, config) for name in only or config.buses}
+        self._know()
+
+    def _keeper(self, name: str, config: Config) -> Keeper:
+        return Keeper(name, config.buses[name], config.models[name], self._event, self._trace)
+
+    def _know(self) -> None:
+        """The names that go with the keepers."""
+        self.buses: dict[str, BusService] = {name: keeper.bus for name, keeper in self.keepers.items()}
+        self._names = {name: place for name, place in self.config.names.items() if place[0] in self.keepers}
+
+    @property
+    def names(self) -> Mapping[str, tuple[str, str]]:
+        return self._names
+
+    def bus_of(self, name: str) -> tuple[BusService, str]:
+        """The bus and the bare name of a servo, by full or unique bare name. Raises UnknownName."""
+        bus, servo = self._names.get(name) or self._names[self.full_name(name)]
+        return self.buses[bus], servo
+
+    # Lines
+
+    async def start(self, *, degraded: bool) -> None:
+        """Until every line was tried. Raises the first LinkDown, unless `degraded`."""
+        for keeper in self.keepers.values():
+            self._group.start_soon(keeper.run, degraded)
+        for keeper in self.keepers.values():
+            await keeper.tried.wait()
+        if not degraded:
+            for name, keeper in self.keepers.items():
+                if keeper.down is not None:
+                    raise keeper.down.at(bus=name)
+
+    async def acquire(self, *names: str) -> None:
+        self.full_names(names)
+
+    async def release(self, *names: str) -> None:
+        self.full_names(names)
+
+    async def reload(self) -> Reload:
+        if self.path is None:
+            raise NotSupported("this rig was not opened from a file, so there is none to read again")
+        config = load_config(self.path)  # an invalid file ends here, and nothing has changed
+        if self._reloading is not None and not self._reloading.done():
+            raise LeaseHeld("the config is being read anew already: wait until that is done")
+        self._reloading = asyncio.create_task(self._reload(config))
+        return await asyncio.shield(self._reloading)  # a caller that leaves does not stop it half-way
+
+    async def _reload(self, config: Config) -> Reload:
+        await asyncio.gather(*self._stopping)
+        wanted = [name for name in config.buses if not self._only or name in self._only]
+        kept = {name for name in self.keepers if name in wanted and config.has_same(name, self.config)}
+        gone = {name: keeper for name, keeper in self.keepers.items() if name not in kept}
+        self.left.update(await self._leave(gone.values()))
+        await asyncio.gather(*map(self._end, gone.values()))
+        latched = self.stopped
+        self.config = config
+        self.keepers = {name: self.keepers[name] if name in kept else self._keeper(name, config) for name in wanted}
+        self._know()
+        new = [name for name in wanted if name not in kept]
+        for name in new:
+            self.buses[name].motion.latched = latched
+            self._group.start_soon(self.keepers[name].run, True)
+        added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
+        report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
+        self._event("reloaded", **asdict(report))
+        return report
+
+    @staticmethod
+    async def _end(keeper: Keeper) -> None:
+        keeper.scope.cancel()
+        await keeper.close()
+
+    async def leave(self) -> None:
+        """Exit policies, on all buses at once. `left` tells what became of each servo."""
+        reloading = () if self._reloading is None else (self._reloading,)
+        await asyncio.gather(*self._stopping, *reloading, return_exceptions=True)
+        self.left.update(await self._leave(self.keepers.values()))
+
+    @staticmethod
+    async def _leave(keepers: Iterable[Keeper]) -> dict[str, StopReport]:
+        reports = await asyncio.gather(*(keeper.leave() for keeper in keepers))
+        return {name: report for part in reports for name, report in part.items()}
+
+    async def close(self) -> None:
+        """Every line, once nobody opens them again."""
+        await asyncio.gather(*(keeper.close() for keeper in self.keepers.values()))
+
+    # Motion
+
+    async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
+        parts: dict[BusService, dict[str, Goal]] = {}
+        for name, goal in goals.items():
+            bus, servo = self.bus_of(name)
+            if servo in parts.setdefault(bus, {}):
+                raise LimitError(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
+            parts[bus][servo] = goal
+        checked = {bus: bus.motion.check(part) for bus, part in parts.items()}
+        futures = {
+            f"{bus.name}/{servo}": future
+            for bus, part in checked.items()
+            for servo, future in bus.motion.put(part, together=together, confirm=confirm).items()
+        }
+        return await outcomes(futures)
+
+    async def enable(self, *names: str) -> None:
+        await self._each(names, lambda bus, servo: bus.motion.enable(servo))
+
+    async def disable(self, *names: str) -> None:
+        await self._each(names, lambda bus, servo: bus.motion.disable(servo))
+
+    async def stop(self) -> dict[str, StopReport]:
+        stopping = self._track(self._stop_all())
+        return await asyncio.shield(stopping)  # a caller that leaves does not end it
+
+    async def _stop_all(self) -> dict[str, StopReport]:
+        self._event("estop")
+        parking = [(keeper, record) for keeper in self.keepers.values() for record in keeper.enabled("on_estop", "park")]
+        reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
+        for keeper, record in parking:
+            self._track(keeper.park(record))
+        return {
+            f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
+        }
+
+    def _track(self, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
+        task = asyncio.create_task(work)
+        self._stopping.add(task)
+        task.add_done_callback(self._stopping.discard)
+        return task
+
+    async def clear(self) -> None:
+        if self._stopping:
+            raise EStopped("servos are still being stopped or parked: clear when they stand")
+        for bus in self.buses.values():
+            bus.motion.latched = False
+        self._event("estop_cleared")
+
+    @property
+    def stopped(self) -> bool:
+        return any(bus.motion.latched for bus in self.buses.values())
+
+    async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
+        full = self.full_names(names)
+        places = [self.bus_of(name) for name in full]
+        waits = (bus.motion.settle(servo, tolerance=tolerance, timeout=timeout) for bus, servo in places)
+        return dict(zip(full, await asyncio.gather(*waits), strict=True))
+
+    async def abandon(self, names: Iterable[str]) -> dict[str, StopReport]:
+        """Whoever moved these servos (full names) is gone: each that is enabled does its `on_lost_client`. Returns when that is
+        done, parking too."""
+        parts: dict[str, set[str]] = {}
+        for name in names:
+            bus, servo = self._names[name]
+            parts.setdefault(bus, set()).add(servo)
+        done = await asyncio.gather(*(self._track(self._abandon(self.keepers[bus], part)) for bus, part in parts.items()))
+        return {f"{bus}/{servo}": report for bus, part in zip(parts, done, strict=True) for servo, report in part.items()}
+
+    @staticmethod
+    async def _abandon(keeper: Keeper, servos: Collection[str]) -> dict[str, StopReport]:
+        parking = [record for record in keeper.enabled("on_lost_client", "park") if record.name in servos]
+        reports = await keeper.bus.motion.abandon(servos)
+        parked = await asyncio.gather(*map(keeper.park, parking))
+        return reports | {record.name: report for record, report in zip(parking, parked, strict=True)}
+
+    # Reading
+
+    async def read(self, name: str, *, max_age: float | None = None) -> State:
+        bus, servo = self.bus_of(name)
+        return await bus.read(servo, max_age)
+
+    def state(self, name: str) -> State:
+        """What is known of one, without a turn."""
+        bus, servo = self.bus_of(name)
+        return bus.state(servo)
+
+    def known(self, name: str, max_age: float) -> State | None:
+        """What `read` would answer without a turn; None: it would need one."""
+        bus, servo = self.bus_of(name)
+        return bus.state(servo) if bus.knows(servo, max_age) else None
+
+    def snapshot(self) -> Snapshot:
+        return {name: self.buses[bus].state(servo) for name, (bus, servo) in self._names.items()}
+
+    async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:
+        bus, servo = self.bus_of(name)
+        return await bus.read_register(servo, register, raw=raw)
+
+    async def write_register(self, name: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
+        bus, servo = self.bus_of(name)
+        return await bus.write_register(servo, register, value, raw=raw, persist=persist)
+
+    async def ping(self, name: str) -> int | None:
+        bus, servo = self.bus_of(name)
+        return await bus.ping(servo)
+
+    async def identify(self, name: str) -> Identity:
+        bus, servo = self.bus_of(name)
+        return await bus.identify(servo)
+
+    async def scan(
+        self,
+        bus: str,
+        *,
+        baudrates: Iterable[int] = (),
+        ids: Iterable[int] = (),
+        progress: Callable[[int, int, Found | None], None] | None = None,
+    ) -> list[Found]:
+        service = self._bus(bus)
+        every = PROTOCOLS[service.options.protocol].scan_ids
+        found = []
+        async for asked, count, entry in scan(service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)):
+            hit = None if entry is None else Found(bus, *entry)
+            if hit:
+                found.append(hit)
+            if progress:
+                progress(asked, count, hit)
+        return found
+
+    async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
+        return await self._bus(bus).commission(node, lambda plans: plans.set_id(node, new, save=save))
+
+    async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
+        return await self._bus(bus).commission(node, lambda plans: plans.set_baudrate(node, baudrate, save=save))
+
+    async def command(self, bus: str, node: int, name: str, value: int | None = None) -> tuple[str, ...]:
+        return await self._bus(bus).commission(node, lambda plans: plans.command(node, name, value))
+
+    def _bus(self, name: str) -> BusService:
+        if name not in self.buses:
+            raise UnknownName(f"no bus {name!r}: there are {', '.join(self.buses)}")
+        return self.buses[name]
+
+    def stats(self) -> dict[str, Any]:
+        return {name: bus.snapshot() for name, bus in self.buses.items()}
+
+    async def _each(self, names: Iterable[str], verb: Callable[[BusService, str], Awaitable[None]]) -> None:
+        """Every servo is tried, whatever happens to another."""
+        full = self.full_names(names)
+        results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
+        raise_failures(dict(zip(full, results, strict=True)))
+
+    def _event(self, name: str, **fields: Any) -> None:
+        (log.info if name in QUIET else log.warning)(name, **fields)
+        self.announcer.tell(Event(name, asyncio.get_running_loop().time(), fields))
+
+    def events(self) -> AsyncIterator[Event]:
+        return self.announcer.events()

@@ -1,0 +1,159 @@
+"""A simulated RealMan arm on a TCP port, with the simulated hands of a bus behind it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from random import Random
+from urllib.parse import parse_qs, urlsplit
+
+from servobus.protocols.base import Device
+from servobus.protocols.modbus.codec import ModbusCodec
+from servobus.protocols.model import ServoModel
+from servobus.protocols.options import BusOptions
+from servobus.protocols.realman.codec import Lines, Message, encode
+from servobus.protocols.realman.simulated.arm import SimArm
+from servobus.protocols.registry import PROTOCOLS
+from servobus.timers import clock_of
+
+SCHEME = "realman"
+LATENCY = 0.002
+"""Seconds of one command, beside what the hand takes."""
+CHATTER: Message = {
+    "state": "current_trajectory_state",
+    "trajectory_state": True,
+    "device": 0,
+    "trajectory_connect": 1,
+}
+"""What an arm says unasked."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmFaults:
+    """How bad the connection is; shares of all replies, 0 to 1."""
+
+    duplicate: float = 0.0
+    """Said twice."""
+    late: float = 0.0
+    """Said `late_s` too late; those behind wait."""
+    late_s: float = 0.0
+    split: float = 0.0
+    """Delivered in two pieces."""
+    cut: float = 0.0
+    """Their end is lost, and the next line stands behind them."""
+    chatter: float = 0.0
+    """Behind a line that nobody asked for."""
+    drop: float = 0.0
+    """The connection ends instead."""
+    seed: int = 0
+
+
+class ArmServer:
+    """`async with ArmServer(...) as server: server.port`."""
+
+    def __init__(self, devices: list[Device], generation: int = 3, faults: ArmFaults | None = None) -> None:
+        self.devices = devices
+        self.faults = faults or ArmFaults()
+        self.arm = SimArm(self._exchange, generation)
+        self.port = 0
+        self._rng = Random(self.faults.seed)
+        self._delay = 0.0
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> ArmServer:
+        self._now = clock_of(asyncio.get_running_loop())
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", self.port)
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._server is not None
+        self._server.close()
+        clients = list(self._clients)
+        self.hang_up()
+        await asyncio.gather(*clients, return_exceptions=True)
+
+    def hang_up(self) -> None:
+        """End every connection."""
+        for client in self._clients:
+            client.cancel()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            await self._serve(reader, writer)
+        except (OSError, asyncio.CancelledError):
+            pass  # the client, or the server, is gone
+        finally:
+            self._clients.discard(task)
+            writer.close()
+            with suppress(OSError):
+                await writer.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        lines = Lines()
+        while data := await reader.read(4096):
+            for message in lines.feed(data):
+                self._delay = LATENCY
+                reply = self.arm.handle(message)
+                await asyncio.sleep(self._delay)
+                if reply is not None and not await self._say(writer, encode(reply)):
+                    return
+
+    async def _say(self, writer: asyncio.StreamWriter, line: bytes) -> bool:
+        """With its faults; False: the connection has ended."""
+        hit = self._hit
+        if hit(self.faults.drop):
+            return False
+        if hit(self.faults.late):
+            await asyncio.sleep(self.faults.late_s)
+        if hit(self.faults.chatter):
+            line = encode(CHATTER) + line
+        if hit(self.faults.cut):
+            line = line[: -self._rng.randrange(1, len(line))]
+        if hit(self.faults.duplicate):
+            line += line
+        if hit(self.faults.split):
+            middle = self._rng.randrange(1, len(line))
+            writer.write(line[:middle])
+            await writer.drain()
+            await asyncio.sleep(0.001)
+            line = line[middle:]
+        writer.write(line)
+        await writer.drain()
+        return True
+
+    def _hit(self, share: float) -> bool:
+        return share > 0 and self._rng.random() < share
+
+    def _exchange(self, question: bytes) -> bytes | None:
+        codec = ModbusCodec("device")
+        codec.receive_data(question)
+        frame = codec.next_reply()
+        replies = [reply for device in self.devices for reply in device.handle(frame, self._now())] if frame else []
+        if len(replies) != 1:
+            return None  # nobody there, or two at once
+        self._delay += replies[0].delay + replies[0].late
+        return replies[0].data
+
+
+def is_arm(port: str) -> bool:
+    return port.startswith(f"{SCHEME}:")
+
+
+def arm_server(options: BusOptions, models: Mapping[str, ServoModel]) -> ArmServer:
+    """The hands of a bus behind an arm of the generation that its `port` names; 3, if it names none."""
+    keys = parse_qs(urlsplit(options.port).query)
+    generation = int(keys.get("generation", ["3"])[0])
+    devices = list(PROTOCOLS[options.protocol].devices(options, models))
+    return ArmServer(devices, generation)
+
+
+def address(options: BusOptions, server: ArmServer) -> str:
+    """What to write as `port` to reach it."""
+    return urlsplit(options.port)._replace(netloc=f"127.0.0.1:{server.port}").geturl()

@@ -1,0 +1,46 @@
+"""Simulated buses for other programs: one PTY a bus, or one arm on a TCP port, until cancelled. What `servobus sim` runs.
+
+The `port` of a bus plays no part, but for saying whether its hands are behind a RealMan arm. Bytes take their time at the rate
+that the PTY's user set, and a servo hears only its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import AsyncExitStack, closing
+from pathlib import Path
+
+import anyio
+
+from servobus.protocols.model import ServoModel
+from servobus.protocols.options import BusOptions
+from servobus.simulation.arm import address, arm_server, is_arm
+from servobus.simulation.build import far_end, simulated_line
+from servobus.simulation.pty import SimPty
+
+
+async def serve(
+    buses: Mapping[str, BusOptions],
+    models: Mapping[str, Mapping[str, ServoModel]],
+    announce: Callable[[str, str], None],
+    *,
+    folder: Path | None = None,
+) -> None:
+    """`announce` is told name and path of each bus, once all can be opened. `models`: those of each bus, by bus name. `folder`:
+    where each path is a link with the name of its bus; its files are left alone. Raises FileExistsError, OSError."""
+    loop = asyncio.get_running_loop()
+    async with AsyncExitStack() as stack:
+        paths = {}
+        for name, options in buses.items():
+            if is_arm(options.port):
+                server = await stack.enter_async_context(arm_server(options, models[name]))
+                paths[name] = address(options, server)
+                continue
+            line = stack.enter_context(closing(simulated_line(options, models[name], loop)))
+            symlink = folder / name if folder else None
+            far = far_end(options, line, loop)
+            paths[name] = stack.enter_context(closing(SimPty(far, loop, backlog=line.backlog, symlink=symlink))).path
+        for name, path in paths.items():
+            announce(name, path)
+        await anyio.sleep_forever()

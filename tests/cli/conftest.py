@@ -1,0 +1,37 @@
+"""Commands set up logging for a whole process; a test's process goes on. And what tests of processes start with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import structlog
+
+from tests.cli.processes import LIMP, Terminal
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    yield
+    structlog.reset_defaults()
+
+
+@pytest.fixture(autouse=True)
+def _no_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Whatever runs on this machine is not spoken to."""
+    monkeypatch.setenv("SERVOBUS_SOCKET", str(tmp_path / "no.sock"))
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    with closing(Terminal()) as made:
+        yield made
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> str:
+    path = tmp_path / "rig.yaml"
+    path.write_text(LIMP)
+    return str(path)

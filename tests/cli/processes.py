@@ -1,0 +1,72 @@
+"""Commands as processes, and a terminal for them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import IO
+
+from tests.config.mistakes import GOOD
+
+PLAIN = {
+    name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR", "COLUMNS", "SERVOBUS_CONFIG"}
+}
+LIMP = GOOD.replace("id: 1,", "id: 1, on_exit: limp,")
+
+
+@contextmanager
+def servobus(
+    *arguments: str, stdout: int | IO[bytes] = subprocess.PIPE, stderr: int | IO[bytes] = subprocess.PIPE, **environment: str
+) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "servobus", *arguments],
+        stdout=stdout,
+        stderr=stderr,
+        text=True,
+        env={**PLAIN, **environment},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class Terminal:
+    """80 columns wide. `end` is for the program; what it writes there is read here."""
+
+    def __init__(self) -> None:
+        ours, theirs = os.openpty()
+        self._ours, self.end = os.fdopen(ours, "rb", buffering=0), os.fdopen(theirs, "wb", buffering=0)
+        termios.tcsetwinsize(self.end, (24, 80))
+
+    def some(self) -> str:
+        return (self._ours.read(65536) or b"").decode()
+
+    def rest(self) -> str:
+        """Everything written until all writers are gone."""
+        self.end.close()
+        told = ""
+        with suppress(OSError):  # how Linux says that no writer is left
+            while piece := self.some():
+                told += piece
+        return told
+
+    def close(self) -> None:
+        self.end.close()
+        self._ours.close()
+
+
+def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
+    """The first log line of that name."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        entry: dict[str, object] = json.loads(line)
+        if entry["event"] == event:
+            return entry
+    raise AssertionError(f"{event} was never logged")

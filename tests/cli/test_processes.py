@@ -1,0 +1,203 @@
+"""Commands that stay, as processes: what they print, and how they end by signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.cli.processes import LIMP, servobus, until
+from tests.config.mistakes import GOOD
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_run_ends_in_order(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("run", rig, "--log-every", "0.2") as process:
+        assert until(process, "running")["buses"] == ["arm"]
+        state = until(process, "state")
+        assert state["positions"] == {"shoulder": 0.0, "elbow": 0.0}
+        process.send_signal(number)
+        until(process, "ended")
+        assert process.wait(10) == status
+
+
+def test_run_waits_for_a_port(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(GOOD.replace('"sim:"', str(tmp_path / "port")))
+    with servobus("run", str(path)) as process:
+        assert "does not exist" in str(until(process, "waiting_for_port")["reason"])
+        until(process, "running")
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_a_config_that_everybody_may_write_is_not_run(rig: str) -> None:
+    os.chmod(rig, 0o666)
+    with servobus("run", rig) as process:
+        _, told = process.communicate(timeout=20)
+        assert process.returncode == 2
+        assert "everybody may write to it" in told
+
+
+def test_a_second_daemon_is_refused_with_the_pid_of_the_first(rig: str) -> None:
+    with servobus("run", rig) as first:
+        until(first, "running")
+        with servobus("run", rig) as second:
+            _, told = second.communicate(timeout=20)
+            assert second.returncode == 1
+            assert f"daemon (pid {first.pid}) listens at" in told
+        first.terminate()
+        assert first.wait(10) == 0
+
+
+def test_a_reload_by_signal(rig: str) -> None:
+    with servobus("run", rig) as process:
+        until(process, "running")
+        text = Path(rig).read_text()
+        Path(rig).write_text(text.replace("id: 1", "id: 999"))
+        process.send_signal(signal.SIGHUP)
+        assert "found 999" in str(until(process, "reload_refused")["reason"])
+        Path(rig).write_text(text.replace("id: 1", "id: 9"))
+        process.send_signal(signal.SIGHUP)
+        assert until(process, "reloaded")["changed"] == ["arm"]
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_the_commands_talk_to_the_daemon(rig: str) -> None:
+    """Enable, move, stop and clear by processes of their own, each without a config."""
+    with servobus("run", rig) as daemon:
+        until(daemon, "running")
+        ended = []
+        for command in (
+            ("enable",),
+            ("move", "shoulder=10"),
+            ("stop",),
+            ("move", "shoulder=0"),
+            ("clear",),
+            ("clear",),
+            ("stats",),
+        ):
+            with servobus(*command) as process:
+                out, err = process.communicate(timeout=20)
+                ended.append((command[0], process.returncode))
+                assert "not latched" not in out + err
+        assert ended == [("enable", 0), ("move", 0), ("stop", 0), ("move", 1), ("clear", 0), ("clear", 0), ("stats", 0)]
+        daemon.terminate()
+        assert daemon.wait(10) == 0
+
+
+def test_a_simulator_and_a_daemon_on_its_port(rig: str, tmp_path: Path) -> None:
+    with servobus("sim", rig, "--folder", str(tmp_path / "ports")) as sim:
+        assert sim.stdout is not None
+        name, path = sim.stdout.readline().split()
+        assert (name, path) == ("arm", str(tmp_path / "ports" / "arm"))
+        real = tmp_path / "real.yaml"
+        real.write_text(LIMP.replace('"sim:"', path))
+        with servobus("run", str(real)) as daemon:
+            until(daemon, "running")
+            with servobus("read", "-c", str(real)) as client:
+                told, _ = client.communicate(timeout=20)
+                assert client.returncode == 0
+                assert "shoulder" in told, "the daemon was asked"
+            with servobus("read", "-c", str(real), "--direct") as second:
+                _, told = second.communicate(timeout=20)
+                assert second.returncode == 1
+                assert f"process {daemon.pid}" in told
+                assert f"the servobus daemon (pid {daemon.pid}) owns it: leave --direct out" in told
+            sim.kill()
+            assert until(daemon, "line_down")["bus"] == "arm"
+            daemon.terminate()
+            assert daemon.wait(10) == 0
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_sim_prints_its_ports_and_nothing_else(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("sim", rig) as process:
+        assert process.stdout is not None
+        name, path = process.stdout.readline().split()
+        assert name == "arm"
+        assert os.path.exists(path)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=10)
+        assert (out, err.strip(), process.returncode) == ("", "", status)
+
+
+def test_an_interrupted_scan_tells_what_it_found(rig: str) -> None:
+    with servobus("scan", "-c", rig, "--baudrate", "9600,1000000", "--json", "--trace") as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "id 9 PING" in line:
+                break
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert isinstance(json.loads(out), list)
+
+
+def test_who_reads_no_further_is_told_nothing() -> None:
+    with servobus("schema") as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+        assert process.wait(10) == 1
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGHUP, 143), (signal.SIGINT, 130)])
+def test_an_interrupted_move_leaves_the_servo_as_its_on_exit_says(rig: str, number: signal.Signals, status: int) -> None:
+    with servobus("move", "-c", rig, "shoulder=80", "--speed", "1", "--timeout", "100", "--trace") as process:
+        assert process.stderr is not None
+        torque_on = "WRITE 0x28 = 01"
+        assert any(torque_on in line for line in process.stderr)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+        assert process.returncode == status
+        assert "SYNC_WRITE 0x28 id 1 = 00" in err
+        assert out == ""
+
+
+def test_a_trace_that_nobody_reads_does_not_stop_a_motion(rig: str) -> None:
+    with servobus("move", "-c", rig, "shoulder=5", "--speed", "300", "--trace") as process:
+        assert process.stderr is not None
+        process.stderr.readline()
+        process.stderr.close()
+        assert process.stdout is not None
+        assert "arm/shoulder" in process.stdout.read()
+        assert process.wait(10) == 0
+
+
+def test_logs_that_nobody_reads_do_not_stop_a_daemon(rig: str) -> None:
+    with servobus("run", rig, "--log-every", "0.1") as process:
+        until(process, "state")
+        assert process.stderr is not None
+        process.stderr.close()
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_a_picture_that_nobody_reads_ends_the_monitor(rig: str) -> None:
+    with servobus("monitor", "-c", rig, "--hz", "50") as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.wait(10) == 1
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+
+
+def test_a_line_that_is_lost_during_a_scan_does_not_lose_what_was_found(rig: str, tmp_path: Path) -> None:
+    with servobus("sim", rig) as sim:
+        assert sim.stdout is not None
+        path = sim.stdout.readline().split()[1]
+        with servobus("scan", "--port", path, "--baudrate", "1000000", "--json", "--trace") as scan:
+            assert scan.stderr is not None
+            assert any("id 9 PING" in line for line in scan.stderr)
+            sim.kill()
+            out, err = scan.communicate(timeout=20)
+            assert scan.returncode == 1
+            assert [hit["id"] for hit in json.loads(out)] == [1, 2]
+            assert "servobus: line: " in err

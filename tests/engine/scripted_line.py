@@ -1,0 +1,89 @@
+"""A bus whose far end does what the test says, in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+
+from servobus.bus.service import BusService
+from servobus.links.memory import MemoryLink
+from servobus.protocols.base import LineTraits
+from servobus.protocols.registry import PROTOCOLS
+from servobus.protocols.sms.codec import Instruction, SmsCodec, encode
+from tests.simulated_rigs import config
+
+Answers = Sequence[tuple[float, bytes]]
+"""Seconds from the question, bytes."""
+
+
+class Puppet:
+    """Answers READ with the id where that is read and else with zeros, and all else with health 0, until `script` is set."""
+
+    def __init__(self) -> None:
+        self.script: Callable[[bytes], Answers | None] = lambda frame: None
+        """None: as usual."""
+        self.heard: list[bytes] = []
+        self.baudrates: list[int] = []
+        self._loop = asyncio.get_running_loop()
+        self._deliver: Callable[[bytes], object] = bytes
+        self._until: dict[int, float] = {}
+        """A servo and its UART are a queue: no answer of one overtakes another."""
+
+    def attach(self, deliver: Callable[[bytes], None]) -> None:
+        self._deliver = deliver
+
+    def receive(self, data: bytes) -> None:
+        self.heard.append(data)
+        found = self.script(data)
+        for delay, answer in self.usual(data) if found is None else found:
+            due = max(self._loop.time() + delay, self._until.get(data[2], 0.0))
+            self._until[data[2]] = due
+            self._loop.call_at(due, self._deliver, answer)
+
+    def set_baudrate(self, baudrate: int) -> None:
+        self.baudrates.append(baudrate)
+
+    def say(self, data: bytes) -> None:
+        """Now, unasked."""
+        self._deliver(data)
+
+    @staticmethod
+    def usual(data: bytes) -> Answers:
+        codec = SmsCodec()
+        codec.receive_data(data)
+        packet = codec.next_reply()
+        assert packet is not None
+        if packet.id == 0xFE:
+            return []
+        if packet.code != Instruction.READ:
+            return [(0.001, encode(packet.id, 0))]
+        address, size = packet.params
+        return [(0.001, encode(packet.id, 0, bytes(packet.id if address + at == 5 else 0 for at in range(size))))]
+
+
+class Events(list[str]):
+    """Names of what the bus reported."""
+
+    def __call__(self, name: str, **fields: object) -> None:
+        self.append(name)
+
+
+@asynccontextmanager
+async def puppet_bus(
+    *servos: str, traits: LineTraits | None = None, started: bool = True, **keys: str
+) -> AsyncIterator[tuple[BusService, Puppet, MemoryLink, Events]]:
+    """A bus of two STS, introduced unless `started` is False."""
+    setup = config(*(servos or ("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts}")), **keys)
+    options, models = setup.buses["arm"], setup.models["arm"]
+    puppet, events, entry = Puppet(), Events(), PROTOCOLS["sms"]
+    link = MemoryLink(puppet, traits or LineTraits(can_change_baud=True))
+    bus = BusService("arm", options, entry.driver(options, models), entry.codec(options), link.traits, events)
+    await link.connect(bus.master)
+    if started:
+        await bus.start()
+        puppet.heard.clear()
+    try:
+        yield bus, puppet, link, events
+    finally:
+        await bus.master.close()

@@ -1,0 +1,76 @@
+"""A bare PTY: the test holds the far side in its hands."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import select
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from servobus.simulation.pty import TCGETS2, TERMIOS2
+from tests.links.recorder import PATIENCE
+
+
+class Pty:
+    """`path` is what a link opens. The slave is held open, so that its settings can be read back."""
+
+    def __init__(self) -> None:
+        self._master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self.slave)
+
+    def say(self, data: bytes) -> None:
+        """When this returns the bytes can be read at the other side."""
+        assert os.write(self._master, data) == len(data)
+        assert select.select([self.slave], [], [], PATIENCE)[0]
+
+    async def hear(self, size: int) -> bytes:
+        """So many bytes."""
+        heard = b""
+        while len(heard) < size:
+            await self._readable()
+            heard += os.read(self._master, size - len(heard))
+        return heard
+
+    def heard(self) -> bytes:
+        """What has come and was not heard yet."""
+        try:
+            return os.read(self._master, 100_000)
+        except BlockingIOError:
+            return b""
+
+    def baudrate(self) -> int:
+        rate: int = TERMIOS2.unpack(fcntl.ioctl(self.slave, TCGETS2, bytes(TERMIOS2.size)))[-1]
+        return rate
+
+    def unplug(self) -> None:
+        if self._master >= 0:
+            os.close(self._master)
+            self._master = -1
+
+    def close(self) -> None:
+        self.unplug()
+        os.close(self.slave)
+
+    async def _readable(self) -> None:
+        loop = asyncio.get_running_loop()
+        ready = asyncio.Event()
+        loop.add_reader(self._master, ready.set)
+        try:
+            async with asyncio.timeout(PATIENCE):
+                await ready.wait()
+        finally:
+            loop.remove_reader(self._master)
+
+
+@contextmanager
+def plugged() -> Iterator[Pty]:
+    pty = Pty()
+    try:
+        yield pty
+    finally:
+        pty.close()

@@ -1,0 +1,108 @@
+"""A bench with simulated KST servos, a driver, and a plain function between them that owns the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, TypeVar
+
+from hypothesis import settings
+
+from servobus.errors import ReplyTimeout
+from servobus.protocols.base import Plan, Request, run_plan
+from servobus.protocols.kst.codec import Frame, KstCodec, encode
+from servobus.protocols.kst.driver import KstDriver
+from servobus.protocols.kst.model import KstModel
+from servobus.protocols.kst.model_loading import packaged_model
+from servobus.protocols.kst.options import KstBus
+from servobus.protocols.kst.simulated.device import KstDevice, devices
+from servobus.simulation.line import blend
+from servobus.values import Goal, ServoGoal
+
+R = TypeVar("R")
+TRIES = 3
+steady = settings(deadline=None, derandomize=True)
+"""For properties: the same examples in each run, and no opinion on how long they take."""
+
+
+def frame_of(data: bytes) -> Frame:
+    codec = KstCodec(data[1], strict=False)
+    codec.receive_data(data)
+    frame = codec.next_reply()
+    assert frame is not None
+    return frame
+
+
+def bus_options(servos: dict[str, dict[str, Any]] | None = None, **keys: Any) -> KstBus:
+    servos = {"pan": {"id": 1}, "tilt": {"id": 2}} if servos is None else servos
+    return KstBus.model_validate({"protocol": "kst", "port": "sim:", "servos": servos, **keys})
+
+
+def changed_model(**parts: Any) -> KstModel:
+    return KstModel.model_validate({**packaged_model().model_dump(), **parts})
+
+
+class Bench:
+    """A driver and its servos on a line that takes no time. Nothing is lost but what `loses` says."""
+
+    def __init__(self, servos: dict[str, dict[str, Any]] | None = None, *, model: KstModel | None = None, **keys: Any) -> None:
+        self.options = bus_options(servos, **keys)
+        models = dict.fromkeys((servo.model for servo in self.options.servos.values()), model or packaged_model())
+        self.driver = KstDriver(self.options, models)
+        self.devices = devices(self.options, models)
+        self.now = 0.0
+        self.baudrate = self.options.baudrate
+        self.said: list[Request[Any]] = []
+        """What the master said, repetitions included."""
+        self.loses: Callable[[Request[Any]], bool] = lambda request: False
+
+    def exchange(self, request: Request[Any]) -> Any:
+        """As the engine does it: three tries for what may be repeated."""
+        for _ in range(TRIES if request.idempotent else 1):
+            self.said.append(request)
+            replies = self._heard(request)
+            if not request.replies:
+                return request.parse(())
+            if replies:
+                return request.parse(replies)
+        raise ReplyTimeout("no answer", request=request)
+
+    def run(self, plan: Plan[R]) -> R:
+        return run_plan(plan, self.exchange)
+
+    def frames(self) -> list[bytes]:
+        """What was said since the last call."""
+        said, self.said = self.said, []
+        return [request.frame for request in said]
+
+    def after(self, seconds: float) -> Bench:
+        self.now += seconds
+        return self
+
+    def _heard(self, request: Request[Any]) -> list[Frame]:
+        """Answers that are whole and belong to the question; those that come at once collide."""
+        packet = frame_of(request.frame)
+        said = [
+            reply.data for device in self.devices if device.baudrate == self.baudrate for reply in device.handle(packet, self.now)
+        ]
+        if not said or self.loses(request):
+            return []
+        codec = KstCodec(self.options.version_byte, strict=self.options.pad_check == "strict")
+        codec.receive_data(reduce(lambda one, other: blend(one, other, 0), said))
+        reply = codec.next_reply()
+        return [reply] if reply is not None and request.answers(reply) else []
+
+
+def device_of(**settings: Any) -> KstDevice:
+    return KstDevice(packaged_model(), **settings)
+
+
+def tell(device: KstDevice, command: int, data: bytes = b"", *, to: int | None = None, now: float = 0.0) -> Frame | None:
+    """What the device answers, if it does."""
+    replies = device.handle(frame_of(encode(device.node if to is None else to, command, data, device.version)), now)
+    assert len(replies) <= 1
+    return frame_of(replies[0].data) if replies else None
+
+
+def goal(servo: str, value: float, **fields: Any) -> ServoGoal:
+    return ServoGoal(servo, Goal("position", value, **fields), start=0.0)

@@ -1,0 +1,172 @@
+"""A bench with simulated hands, a driver, and a plain function between them that owns the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from servobus.errors import ReplyTimeout
+from servobus.protocols.base import Plan, Request, run_plan
+from servobus.protocols.modbus.codec import Frame, ModbusCodec, encode, pack, words
+from servobus.protocols.roh.driver import RohDriver
+from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.model_loading import load_models, packaged_models
+from servobus.protocols.roh.options import RohBus
+from servobus.protocols.roh.simulated.device import RohDevice, devices
+from servobus.values import Goal, Outcome, ServoGoal
+
+R = TypeVar("R")
+TRIES = 3
+HAND: dict[str, dict[str, Any]] = {channel: {"id": 2, "channel": channel} for channel in CHANNELS}
+"""All fingers of unit 2."""
+THREE: dict[str, dict[str, Any]] = {
+    f"{name}_{channel}": {"id": unit, "channel": channel}
+    for unit, name in enumerate(("legacy", "v1", "v2"), 2)
+    for channel in CHANNELS
+}
+"""All fingers of three hands."""
+
+
+def question(data: bytes) -> Frame:
+    codec = ModbusCodec("device")
+    codec.receive_data(data)
+    frame = codec.next_reply()
+    assert frame is not None
+    assert frame.frame == data
+    return frame
+
+
+def answer(data: bytes) -> Frame:
+    codec = ModbusCodec()
+    codec.receive_data(data)
+    frame = codec.next_reply()
+    assert frame is not None
+    assert frame.frame == data
+    return frame
+
+
+def bus_options(servos: dict[str, dict[str, Any]] | None = None, **keys: Any) -> RohBus:
+    servos = HAND if servos is None else servos
+    return RohBus.model_validate({"protocol": "roh", "port": "sim:", "servos": servos, **keys})
+
+
+class Bench:
+    """A driver and its hands on a line that takes no time. Nothing is lost but what `loses` says."""
+
+    def __init__(
+        self, servos: dict[str, dict[str, Any]] | None = None, *, maps: dict[int, str] | None = None, **keys: Any
+    ) -> None:
+        """`maps`: what each hand has, when that is not what the config pins."""
+        self.options = bus_options(servos, **keys)
+        self.models = load_models(self.options, Path())
+        self.driver = RohDriver(self.options, self.models)
+        self.devices = [
+            RohDevice(self.models[maps[hand.node]], hand.node) if maps and hand.node in maps else hand
+            for hand in devices(self.options, self.models)
+        ]
+        self.now = 0.0
+        self.said: list[Request[Any]] = []
+        """What the master said, repetitions included."""
+        self.loses: Callable[[Request[Any]], bool] = lambda request: False
+
+    @property
+    def hand(self) -> RohDevice:
+        return self.devices[0]
+
+    def exchange(self, request: Request[Any]) -> Any:
+        """As the engine does it: three tries for what may be repeated."""
+        for _ in range(TRIES if request.idempotent else 1):
+            self.said.append(request)
+            heard = self._heard(request)
+            self.now += request.service_time
+            if not request.replies:
+                return request.parse(())
+            if heard:
+                return request.parse(heard)
+        raise ReplyTimeout("no answer", request=request)
+
+    def _heard(self, request: Request[Any]) -> list[Frame]:
+        said = [reply.data for hand in self.devices for reply in hand.handle(question(request.frame), self.now)]
+        if not said or self.loses(request):
+            return []
+        assert len(said) == 1
+        reply = answer(said[0])
+        return [reply] if request.answers(reply) else []
+
+    def run(self, plan: Plan[R]) -> R:
+        return run_plan(plan, self.exchange)
+
+    def frames(self) -> list[str]:
+        """What was said since the last call, in words."""
+        said, self.said = self.said, []
+        return [ModbusCodec().describe(request.frame, sent=True) for request in said]
+
+    def after(self, seconds: float) -> Bench:
+        self.now += seconds
+        for hand in self.devices:
+            hand.advance(self.now)
+        return self
+
+    def enable(self, *servos: str) -> Bench:
+        for servo in servos or self.driver.nodes:
+            self.run(self.driver.enable(servo))
+        self.frames()
+        return self
+
+    def move(self, *goals: ServoGoal, together: bool = False) -> dict[str, Outcome | Exception]:
+        results: dict[str, Outcome | Exception] = {}
+        for turn in self.driver.plan(goals, together=together, confirm=False):
+            results |= self.run(turn.plan)
+        return results
+
+    def read(self, servo: str, register: str, *, raw: bool = False) -> Any:
+        return self.exchange(self.driver.read_register(servo, register, raw=raw))
+
+    def write(self, servo: str, register: str, value: Any, **how: bool) -> Any:
+        return self.run(self.driver.write_register(servo, register, value, **how))
+
+
+def bench_of(name: str, **keys: Any) -> Bench:
+    """One hand that has this map, whatever the config says."""
+    return Bench(maps={2: name}, **keys)
+
+
+def goal(servo: str, value: float, *, start: float | None = None, **fields: Any) -> ServoGoal:
+    return ServoGoal(servo, Goal(fields.pop("kind", "position"), value, **fields), start)
+
+
+def hand_of(name: str = "v2", unit: int = 2) -> RohDevice:
+    return RohDevice(packaged_models()[name], unit)
+
+
+def tell(hand: RohDevice, function: int, body: bytes, *, to: int | None = None, now: float = 0.0) -> Frame | None:
+    """What the hand answers, if it does."""
+    replies = hand.handle(question(encode(hand.node if to is None else to, function, body)), now)
+    assert len(replies) <= 1
+    return answer(replies[0].data) if replies else None
+
+
+def look(hand: RohDevice, address: int, count: int = 1, *, now: float = 0.0) -> list[int]:
+    """What is read there; an exception is an empty list."""
+    reply = tell(hand, 3, pack((address, count)), now=now)
+    assert reply is not None
+    return words(reply.body[1:])
+
+
+def put(hand: RohDevice, address: int, values: Sequence[int] | int, *, now: float = 0.0, to: int | None = None) -> int | None:
+    """0: taken; else the exception; None: no answer."""
+    some = [values] if isinstance(values, int) else list(values)
+    body = pack((address, len(some))) + bytes((2 * len(some),)) + pack(some)
+    reply = tell(hand, 0x10, body, now=now, to=to)
+    if reply is None:
+        return None
+    return reply.body[0] if reply.function & 0x80 else 0
+
+
+def three_hands(**keys: Any) -> Bench:
+    return Bench(THREE, maps={2: "legacy", 3: "v1", 4: "v2"}, **keys)
+
+
+def all_fingers(value: float, **fields: Any) -> list[ServoGoal]:
+    return [goal(channel, value, **fields) for channel in CHANNELS]

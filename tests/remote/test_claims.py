@@ -1,0 +1,67 @@
+"""What a client believes to hold: given the time."""
+
+from __future__ import annotations
+
+from servobus.remote.claims import Claims
+
+A, B = "arm/a", "arm/b"
+
+
+def claims() -> Claims:
+    made = Claims()
+    made.ttl = 0.5
+    return made
+
+
+def test_nothing_was_lost_by_who_held_nothing() -> None:
+    assert claims().to_acquire([A, B], 1000.0) == set()
+
+
+def test_what_is_renewed_in_time_is_held() -> None:
+    mine = claims()
+    mine.taken([A], 10.0)
+    assert mine.to_acquire([A], 10.49) == set()
+    mine.renewed([A], 10.3)
+    assert mine.to_acquire([A], 10.79) == set()
+
+
+def test_what_was_not_renewed_is_to_be_acquired_until_it_is() -> None:
+    mine = claims()
+    mine.taken([A], 10.0)
+    assert mine.to_acquire([A, B], 10.5) == {A}
+    assert mine.to_acquire([A], 11.0) == {A}
+    assert mine.to_acquire([B], 11.0) == set()
+    mine.taken([A], 11.0)
+    assert mine.to_acquire([A], 11.1) == set()
+
+
+def test_what_the_daemon_does_not_confirm_is_lost() -> None:
+    mine = claims()
+    mine.taken([A, B], 10.0)
+    mine.renewed([B], 10.2)
+    assert mine.to_acquire([A, B], 10.3) == {A}
+
+
+def test_an_older_wish_does_not_shorten_a_lease() -> None:
+    mine = claims()
+    mine.taken([A], 10.0)
+    mine.taken([B], 9.0)
+    assert mine.to_acquire([A, B], 10.4) == set()
+
+
+def test_what_was_refused_needs_a_new_wish() -> None:
+    mine = claims()
+    mine.taken([A, B], 10.0)
+    mine.refused([A])
+    assert mine.to_acquire([A, B], 10.1) == {A}
+
+
+def test_what_was_given_back_or_held_through_another_connection_is_no_loss() -> None:
+    mine = claims()
+    mine.taken([A, B], 10.0)
+    mine.released([A])
+    assert mine.held == {B}
+    assert mine.to_acquire([A], 99.0) == set()
+    mine.clear()
+    assert mine.to_acquire([A, B], 99.0) == set()
+    assert mine.held == set()
