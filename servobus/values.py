@@ -42,11 +42,11 @@ class Goal:
     """Unit/s^2; None: the servo's own setting."""
     effort: float | None = None
     """Percent of the greatest torque."""
-    deadline: float | None = None
+    start_within: float | None = None
     """Seconds from acceptance within which its first byte must leave; None: the servo's `ttl`."""
 
 
-GOAL_NUMBERS = ("value", "speed", "duration", "acceleration", "effort", "deadline")
+GOAL_NUMBERS = ("value", "speed", "duration", "acceleration", "effort", "start_within")
 """The fields of a goal that are finite numbers; all but `value` may be None."""
 
 

@@ -33,7 +33,7 @@ def config(*servos: str, port: str = "sim:", **keys: Any) -> Config:
 
 def devices(rig: LocalRig, bus: str = "arm") -> dict[int, SmsDevice]:
     """The simulated servos of a bus in memory, by id."""
-    link = cast("SimLink", rig.keepers[bus].link)
+    link = cast("SimLink", rig.supervisors[bus].link)
     return {device.node: cast("SmsDevice", device) for device in link.line.devices}
 
 

@@ -9,7 +9,7 @@ from servobus.rig.local import LocalRig
 TORQUE, GOAL = "torque_enable", "goal_position"
 
 
-class Wire:
+class WireLog:
     """Keeps the frames that were said."""
 
     def __init__(self) -> None:

@@ -21,7 +21,7 @@ TURNAROUND = 0.0005
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
+class Bandwidth:
     """Of one bus. Shares in percent of the line's time, latencies in seconds from the call to the last byte of its frame."""
 
     shares: dict[str, float]
@@ -38,9 +38,9 @@ class Load:
         return sum(self.shares.values())
 
 
-def wire_load(options: BusOptions, driver: Driver, traits: LineTraits) -> Load:
+def line_bandwidth(options: BusOptions, driver: Driver, traits: LineTraits) -> Bandwidth:
     """Goals of all servos at the bus's `goal_rate`, polls at theirs."""
-    driver.carries(traits)
+    driver.use_traits(traits)
     goals = _goal_requests(options, driver)
     shares = {"goals": 100 * options.rate_of_goals * _seconds(goals, traits)}
     longest = max((_seconds([request], traits) for request in goals), default=0.0)
@@ -52,7 +52,7 @@ def wire_load(options: BusOptions, driver: Driver, traits: LineTraits) -> Load:
             shares[poll.name] = shares.get(poll.name, 0.0) + 100 * poll.hz * seconds
             longest = max(longest, seconds)
     silent = min(FIRST_DEADLINE, (options.timeout_ms or 1000) / 1000) + QUIET
-    return Load(
+    return Bandwidth(
         shares,
         goal_latency=2 * longest + _seconds(goals, traits) + traits.latency,
         estop_latency=longest + _seconds(_stop_requests(driver), traits) + traits.latency,
@@ -78,7 +78,7 @@ def _goal_requests(options: BusOptions, driver: Driver) -> list[Request[Any]]:
     requests: list[Request[Any]] = []
     for _ in range(2 if goals else 0):
         requests.clear()
-        for turn in driver.plan(goals, together=False, confirm=False):
+        for turn in driver.plan_goals(goals, together=False, confirm=False):
             run_plan(turn.plan, requests.append)
     return requests
 

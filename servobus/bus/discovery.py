@@ -21,13 +21,13 @@ PAUSE = 1.0
 """Seconds between two attempts to learn who a servo is that answers, but not to that."""
 
 
-class Introduction:
+class Discovery:
     """Who is there, once for each node: what one servo says of it holds for the others."""
 
     def __init__(self, bus: BusService) -> None:
         self._bus = bus
 
-    async def everyone(self) -> None:
+    async def identify_all(self) -> None:
         """A missing servo is an event, no error."""
         nodes = dict.fromkeys(record.node for record in self._bus.records.values())
         await asyncio.gather(*map(self._meet, nodes))
@@ -57,7 +57,7 @@ class Introduction:
             names = ",".join(record.name for record in records)
             bus.event("servo_missing", bus=bus.name, servo=names, id=node.id, reason=error.message)
 
-    def met(self, record: ServoRecord, identity: Identity) -> None:
+    def identified(self, record: ServoRecord, identity: Identity) -> None:
         """Somebody was asked who it is."""
         if record.identity != identity:
             for note in identity.notes:
@@ -68,13 +68,13 @@ class Introduction:
     def changed(self, node: Node, now: float) -> None:
         """One that was missing at the start has appeared."""
         record = self._bus.on(node)[0]
-        if node.condition is not Condition.ONLINE or record.identity is not None or now < record.introduce_after:
+        if node.condition is not Condition.ONLINE or record.identity is not None or now < record.identify_after:
             return
-        record.introduce_after = now + PAUSE
+        record.identify_after = now + PAUSE
 
         def introduced(result: Identity | Exception) -> None:
             if isinstance(result, Identity):
-                self.met(record, result)
+                self.identified(record, result)
 
         plan = self._bus.driver.identify(record.name)
         self._bus.scheduler.requests.put(Job(Callback(introduced), now + PATIENCE, plan=plan, node=node.id))

@@ -24,7 +24,7 @@ from servobus.timers import CoarseTimer, FineTimer, clock_of
 
 CLOSE_TIMEOUT = 0.5
 """Seconds for the last bytes to leave."""
-SECOND_LOOK = 0.001
+SECOND_POLL = 0.001
 """For links that cannot be looked at: one more pass of the loop before a deadline is declared missed."""
 
 
@@ -290,8 +290,8 @@ class BusMaster(asyncio.Protocol):
         if self._clock() >= turn.deadline and not turn.looked:
             # What has arrived and was not read yet is not late.
             turn.looked = True
-            if not self._transport.look():
-                turn.deadline = self._clock() + SECOND_LOOK
+            if not self._transport.poll_input():
+                turn.deadline = self._clock() + SECOND_POLL
         now = self._clock()
         if turn in self._flight and now >= turn.deadline:
             self._missed(turn, now)

@@ -25,7 +25,7 @@ from servobus.values import Goal, Outcome, ServoGoal, State, StopReport, StopTar
 if TYPE_CHECKING:
     from servobus.bus.service import BusService
 
-LEAST_TTL = 0.2
+MIN_TTL = 0.2
 """Seconds a goal may wait for its first byte, unless two learned turns take longer."""
 FRESH = 0.1
 """Seconds for which a position is good enough to be held at once by an e-stop."""
@@ -85,7 +85,7 @@ class Motion:
 
     def _pace(self, ticket: Ticket) -> None:
         """Where the servo keeps no speed, the host does; any way it was being led on ends."""
-        profile, speed = self._bus.scheduler.profile, self._bus.driver.pace(ticket.goal)
+        profile, speed = self._bus.scheduler.profile, self._bus.driver.host_speed(ticket.goal)
         if speed is None:
             profile.drop({ticket.servo})
         else:
@@ -94,7 +94,7 @@ class Motion:
     def _ticket(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome]) -> Ticket:
         now = self._bus.clock()
         patience = 2 * (record.node.deadline + self._bus.line.traits.latency)
-        ttl = goal.deadline or record.options.ttl or max(LEAST_TTL, patience)
+        ttl = goal.start_within or record.options.ttl or max(MIN_TTL, patience)
         position = record.position(now, FRESH)
         start = record.reference() if position is None else position
         return Ticket(ServoGoal(record.name, goal, start), record.node.id, now + ttl, partial(self._settle, record, goal, future))

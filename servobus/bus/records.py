@@ -16,8 +16,8 @@ class ServoRecord:
         "_fields",
         "enabled",
         "generation",
+        "identify_after",
         "identity",
-        "introduce_after",
         "name",
         "node",
         "options",
@@ -37,7 +37,7 @@ class ServoRecord:
         self.touched = False
         """We may have switched its torque on, even if enable() did not come through: at the end it is left as `on_exit` says."""
         self.identity: Identity | None = None
-        self.introduce_after = 0.0
+        self.identify_after = 0.0
         """Not before this is an unknown servo asked again who it is."""
         self.setpoint: float | None = None
         """The last position asked for, or held."""

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar, cast
 
-from servobus.bus.discovery import Introduction
+from servobus.bus.discovery import Discovery
 from servobus.bus.master import BusMaster
 from servobus.bus.motion import Motion
 from servobus.bus.records import ServoRecord
@@ -69,16 +69,16 @@ class BusService:
         for servo, entry in servos.items():
             self.records[servo] = ServoRecord(servo, entry, self.health.node(driver.nodes[servo]))
         self.motion = Motion(self)
-        self.introduction = Introduction(self)
+        self.discovery = Discovery(self)
 
     # Start and end
 
     async def start(self) -> None:
         """After the line was opened: quiet, identify, read; then poll. Writes nothing. A missing servo is an event, no error."""
         if self.options.echo == "auto":
-            await self.introduction.probe_echo()
-        self.driver.carries(self.line.traits)
-        await self.introduction.everyone()
+            await self.discovery.probe_echo()
+        self.driver.use_traits(self.line.traits)
+        await self.discovery.identify_all()
         if self.master.up and self.motion.latched:
             await self.motion.stop()  # asked for while the line was down
         if self.master.up:
@@ -203,7 +203,7 @@ class BusService:
 
     async def identify(self, servo: str) -> Identity:
         identity = await self.perform(self.driver.identify(servo), self.driver.nodes[servo], servo=servo, urgent=True)
-        self.introduction.met(self.records[servo], identity)
+        self.discovery.identified(self.records[servo], identity)
         return identity
 
     # Sessions
@@ -261,7 +261,7 @@ class BusService:
         names = [record.name for record in self.on(node)]
         if Condition.OFFLINE in (node.condition, before):
             self.event(f"servo_{node.condition}", bus=self.name, servo=",".join(names), id=node.id)
-        self.introduction.changed(node, self.clock())
+        self.discovery.changed(node, self.clock())
 
     def on(self, node: Node) -> list[ServoRecord]:
         """The servos of a node."""

@@ -28,12 +28,12 @@ from servobus.remote.rig import RemoteRig
 from servobus.rig.interface import Rig, Snapshot
 from servobus.rig.local import LocalRig
 
-MOST_HZ = 50.0
+MAX_HZ = 50.0
 
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MOST_HZ), help="Pictures per second.")
+@click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MAX_HZ), help="Pictures per second.")
 @click.option("--count", type=click.IntRange(min=1), help="Stop after so many pictures.")
 @click.option("--seconds", type=Number(0.1), help="Stop after so long.")
 @servo_options

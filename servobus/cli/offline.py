@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from servobus.bus.bandwidth import Load, wire_load
+from servobus.bus.bandwidth import Bandwidth, line_bandwidth
 from servobus.cli.output import echo_table, emit
 from servobus.config.loader import Config, config_schema, load_config
 from servobus.errors import ConfigError, UnknownName
@@ -45,12 +45,12 @@ def check(config: str, as_json: bool) -> None:
         click.echo(f"{config}: ok")
 
 
-def loads_of(config: Config) -> dict[str, Load]:
+def loads_of(config: Config) -> dict[str, Bandwidth]:
     """What each bus has to carry."""
     found = {}
     for name, options in config.buses.items():
         driver = PROTOCOLS[options.protocol].driver(options, config.models[name])
-        found[name] = wire_load(options, driver, _traits(options))
+        found[name] = line_bandwidth(options, driver, _traits(options))
     return found
 
 
@@ -60,7 +60,7 @@ def _traits(options: BusOptions) -> LineTraits:
     return open_link(options.port, options.baudrate, rs485=options.rs485).traits
 
 
-def _rows(loads: dict[str, Load]) -> list[tuple[object, ...]]:
+def _rows(loads: dict[str, Bandwidth]) -> list[tuple[object, ...]]:
     return [
         (
             name,
@@ -76,7 +76,7 @@ def _rows(loads: dict[str, Load]) -> list[tuple[object, ...]]:
     ]
 
 
-def _as_dict(load: Load) -> dict[str, Any]:
+def _as_dict(load: Bandwidth) -> dict[str, Any]:
     return {
         "load_percent": {**{name: round(share, 2) for name, share in load.shares.items()}, "total": round(load.total, 2)},
         "goal_latency_ms": round(1e3 * load.goal_latency, 3),

@@ -19,7 +19,7 @@ import structlog
 from rich.console import Console
 from rich.table import Table
 
-from servobus.cli.safe_stream import Voice
+from servobus.cli.safe_stream import SafeStream
 from servobus.values import State
 
 R = TypeVar("R")
@@ -93,7 +93,7 @@ def logs(level: int = logging.WARNING) -> None:
             else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.WriteLoggerFactory(cast("TextIO", Voice(sys.stderr))),
+        logger_factory=structlog.WriteLoggerFactory(cast("TextIO", SafeStream(sys.stderr))),
         cache_logger_on_first_use=False,
     )
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import click
 
 from servobus.cli.frames import Tracer
-from servobus.cli.safe_stream import Voice
+from servobus.cli.safe_stream import SafeStream
 from servobus.config.loader import Config, load_config
 from servobus.errors import ConfigError, DeviceError, LinkDown, NotSupported, PortBusy
 from servobus.protocols.registry import PROTOCOLS
@@ -157,7 +157,7 @@ async def traced(config: Config, options: Options) -> AsyncIterator[Trace | None
         yield None
         return
     codecs = {name: PROTOCOLS[bus.protocol].codec(bus) for name, bus in config.buses.items()}
-    voice = Voice(sys.stderr if options.trace or options.as_json else sys.stdout)
+    voice = SafeStream(sys.stderr if options.trace or options.as_json else sys.stdout)
     tracer = Tracer(codecs, voice.say, heard=options.trace)
     try:
         yield tracer

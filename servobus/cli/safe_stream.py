@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TextIO
 
 
-class Voice:
+class SafeStream:
     """A stream as logs and traces need it; what it says is lost in silence once nobody can hear it."""
 
     def __init__(self, stream: TextIO) -> None:

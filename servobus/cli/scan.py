@@ -25,7 +25,7 @@ from servobus.remote.rig import RemoteRig
 from servobus.rig.interface import Found, Rig
 
 INTERRUPTED, NONE_FOUND = 130, 1
-LEAST_RATE, GREATEST_RATE = 300, 10_000_000
+MIN_RATE, MAX_RATE = 300, 10_000_000
 BUS = "line"
 """What the bus of a bare port is called."""
 HEAD = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
@@ -179,9 +179,9 @@ def _rates(text: str | None, known: tuple[int, ...], bare: bool) -> list[int]:
         rates = list(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
         rates = []
-    if not rates or min(rates) < LEAST_RATE or max(rates) > GREATEST_RATE:
+    if not rates or min(rates) < MIN_RATE or max(rates) > MAX_RATE:
         raise click.BadParameter(
-            f"{text!r}: write rates from {LEAST_RATE} to {GREATEST_RATE} like 1000000,115200, or all", param_hint="--baudrate"
+            f"{text!r}: write rates from {MIN_RATE} to {MAX_RATE} like 1000000,115200, or all", param_hint="--baudrate"
         )
     return rates
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from servobus.config.access import AccessOptions, DoorOptions
 from servobus.documents import reader
-from servobus.documents.problems import Complaints, show, sound_part
+from servobus.documents.problems import Problems, quote, valid_subset
 from servobus.documents.reader import KeyPath
 from servobus.errors import ConfigError, ServobusError
 from servobus.links import TUNNELS, check_port
@@ -93,69 +93,69 @@ def config_schema() -> dict[str, Any]:
 
 
 def _config(document: reader.Document, folder: Path) -> Config:
-    complaints = Complaints(document)
+    problems = Problems(document)
     buses: dict[str, BusOptions] = {}
     models: dict[str, Mapping[str, ServoModel]] = {}
-    for name, data in _bus_entries(document.data, complaints):
-        options = _bus(name, data, complaints)
+    for name, data in _bus_entries(document.data, problems):
+        options = _bus(name, data, problems)
         if options is not None:
             buses[str(name)] = options
-            models[str(name)] = _models(("buses", name), options, folder, complaints)
-    _check_ports(buses, complaints)
+            models[str(name)] = _models(("buses", name), options, folder, problems)
+    _check_ports(buses, problems)
     data = document.data if isinstance(document.data, dict) else {}
-    access = _part(AccessOptions, "access", data, complaints)
-    door = _part(DoorOptions, "door", data, complaints)
-    complaints.raise_any()
+    access = _part(AccessOptions, "access", data, problems)
+    door = _part(DoorOptions, "door", data, problems)
+    problems.raise_any()
     return Config(VERSION, buses, models, access, door)
 
 
-def _part(kind: type[P], key: str, data: Mapping[Any, Any], complaints: Complaints) -> P:
+def _part(kind: type[P], key: str, data: Mapping[Any, Any], problems: Problems) -> P:
     """What the daemon's keys say; all of them may be left out."""
-    return (complaints.validated(kind, data[key], (key,)) if key in data else None) or kind()
+    return (problems.validated(kind, data[key], (key,)) if key in data else None) or kind()
 
 
-def _bus_entries(data: Any, complaints: Complaints) -> list[tuple[str | int, Any]]:
+def _bus_entries(data: Any, problems: Problems) -> list[tuple[str | int, Any]]:
     if not isinstance(data, dict):
-        complaints.add((), f"found {show(data)}; a config begins with `version: 1` and has `buses:`")
+        problems.add((), f"found {quote(data)}; a config begins with `version: 1` and has `buses:`")
         return []
     for key in data:
         if key not in KEYS:
-            complaints.add((key,), f"unknown key; there are {', '.join(KEYS)}", key=True)
+            problems.add((key,), f"unknown key; there are {', '.join(KEYS)}", key=True)
     if data.get("version") != VERSION or isinstance(data.get("version"), bool):
         where: KeyPath = ("version",) if "version" in data else ()
-        complaints.add(where, f"found version {show(data.get('version'))}; write `version: {VERSION}`")
+        problems.add(where, f"found version {quote(data.get('version'))}; write `version: {VERSION}`")
     buses = data.get("buses")
     if not isinstance(buses, dict) or not buses:
-        complaints.add(("buses",) if "buses" in data else (), "no buses; name at least one under `buses:`")
+        problems.add(("buses",) if "buses" in data else (), "no buses; name at least one under `buses:`")
         return []
     return list(buses.items())
 
 
-def _bus(name: str | int, data: Any, complaints: Complaints) -> BusOptions | None:
+def _bus(name: str | int, data: Any, problems: Problems) -> BusOptions | None:
     """The options of a bus; of a bus with mistakes, what else can be checked."""
     path: KeyPath = ("buses", name)
     if not isinstance(name, str):
-        complaints.add(path, f"found {show(name)} as a name; put it in quotes", key=True)
+        problems.add(path, f"found {quote(name)} as a name; put it in quotes", key=True)
         return None
     try:
         _name.validate_python(name)
     except ValueError:
-        complaints.add(path, "a name is letters, digits, . _ - and begins with a letter or digit", key=True)
+        problems.add(path, "a name is letters, digits, . _ - and begins with a letter or digit", key=True)
         return None
     if not isinstance(data, dict):
-        complaints.add(path, f"found {show(data)}; a bus has the keys protocol, port, baudrate, servos")
+        problems.add(path, f"found {quote(data)}; a bus has the keys protocol, port, baudrate, servos")
         return None
     protocol = data.get("protocol")
     if not isinstance(protocol, str) or protocol not in PROTOCOLS:
         where = (*path, "protocol") if "protocol" in data else path
-        complaints.add(where, f"found protocol {show(protocol)}; there are {', '.join(PROTOCOLS)}")
+        problems.add(where, f"found protocol {quote(protocol)}; there are {', '.join(PROTOCOLS)}")
         return None
     kind = PROTOCOLS[protocol].options
-    options: BusOptions | None = complaints.validated(kind, data, path) or sound_part(kind, data)
+    options: BusOptions | None = problems.validated(kind, data, path) or valid_subset(kind, data)
     return options
 
 
-def _models(path: KeyPath, options: BusOptions, folder: Path, complaints: Complaints) -> Mapping[str, ServoModel]:
+def _models(path: KeyPath, options: BusOptions, folder: Path, problems: Problems) -> Mapping[str, ServoModel]:
     """The models of a bus, and what its servos want that those cannot do."""
     found, refused = _find_models(options, folder)
     owners: dict[Any, str] = {}
@@ -164,12 +164,12 @@ def _models(path: KeyPath, options: BusOptions, folder: Path, complaints: Compla
         here = (*path, "servos", servo)
         owner = owners.setdefault(entry.key, servo)
         if owner != servo:
-            complaints.add((*here, "id"), f"found id {entry.id} again (it is {owner}'s); each servo has its own")
+            problems.add((*here, "id"), f"found id {entry.id} again (it is {owner}'s); each servo has its own")
         if servo in refused:
             first = told.setdefault(refused[servo], servo)
-            complaints.add((*here, "model"), refused[servo] if first == servo else f"cannot be used, see {first}")
+            problems.add((*here, "model"), refused[servo] if first == servo else f"cannot be used, see {first}")
         else:
-            _check_servo(here, entry, found[entry.model], complaints)
+            _check_servo(here, entry, found[entry.model], problems)
     return found
 
 
@@ -189,10 +189,10 @@ def _find_models(options: BusOptions, folder: Path) -> tuple[dict[str, ServoMode
     return found, refused
 
 
-def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complaints: Complaints) -> None:
+def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, problems: Problems) -> None:
     """What this model cannot do, or the wire cannot carry."""
     if servo.unit is not None and servo.unit not in model.units:
-        complaints.add((*here, "unit"), f"found {show(servo.unit)}; model {model.name} has {', '.join(model.units)}")
+        problems.add((*here, "unit"), f"found {quote(servo.unit)}; model {model.name} has {', '.join(model.units)}")
         return
     calibration = servo.calibration(model)
     reach = model.reach
@@ -201,7 +201,7 @@ def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complain
         for key, values in (("limits", servo.limits or ()), ("park_pose", [servo.park_pose])):
             for value in values:
                 if value is not None and not ends[0] <= value <= ends[1]:
-                    complaints.add((*here, key), f"found {value:g}; model {model.name} reaches {ends[0]:g} to {ends[1]:g}")
+                    problems.add((*here, key), f"found {value:g}; model {model.name} reaches {ends[0]:g} to {ends[1]:g}")
     greatest = {
         "speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
         "max_speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
@@ -212,7 +212,7 @@ def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, complain
         value = getattr(servo, key)
         if value is not None and most is not None and value > most:
             told = f"model {model.name} takes at most {most:g}" if most else f"model {model.name} has none"
-            complaints.add((*here, key), f"found {value:g}; {told}")
+            problems.add((*here, key), f"found {value:g}; {told}")
 
 
 def _check_tunnel(options: BusOptions) -> None:
@@ -222,7 +222,7 @@ def _check_tunnel(options: BusOptions) -> None:
         raise ConfigError(f"{scheme}:// passes {passes} on and nothing else; {options.protocol} needs a line of its own")
 
 
-def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> None:
+def _check_ports(buses: Mapping[str, BusOptions], problems: Problems) -> None:
     """Each line has one owner, by whatever name it goes."""
     owners: dict[str, str] = {}
     for name, options in buses.items():
@@ -234,8 +234,8 @@ def _check_ports(buses: Mapping[str, BusOptions], complaints: Complaints) -> Non
             check_port(options.port)
             _check_tunnel(options)
         except ServobusError as error:
-            complaints.add(path, error.message.replace(repr(options.port), show(options.port)))
+            problems.add(path, error.message.replace(repr(options.port), quote(options.port)))
             continue
         owner = owners.setdefault(os.path.realpath(options.port), name)
         if owner != name:
-            complaints.add(path, f"found the port of bus {owner} again; put its servos into one bus, a line has one owner")
+            problems.add(path, f"found the port of bus {owner} again; put its servos into one bus, a line has one owner")

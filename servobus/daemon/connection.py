@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import structlog
 
 from servobus.config.access import Role
-from servobus.daemon.fairness import Bucket
+from servobus.daemon.fairness import TokenBucket
 from servobus.daemon.jsonrpc import (
     URGENT,
     Call,
@@ -37,12 +37,12 @@ from servobus.rpc.methods import Hello
 if TYPE_CHECKING:
     from servobus.daemon.server import NativeDoor
 
-MOST_WAITING = 256 * 1024
+MAX_WAITING = 256 * 1024
 """Bytes of one client that may wait; then it is not read until they are fewer. Well above what our own client lets wait, so that
 its `stop` is always read."""
-MOST_TASKS = 256
+MAX_TASKS = 256
 """Calls of one client under way at once, above which only the urgent ones begin."""
-MOST_UNREAD = 256 * 1024
+MAX_UNREAD = 256 * 1024
 """Bytes that a client may be behind with its reading."""
 PATIENCE = 10.0
 """Seconds after which one that reads nothing is left."""
@@ -97,13 +97,13 @@ class Connection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self._transport.set_write_buffer_limits(high=MOST_UNREAD)
+        self._transport.set_write_buffer_limits(high=MAX_UNREAD)
         refusal = self.door.enter(self, transport.get_extra_info("socket"), tcp=self._tcp)
         if refusal is not None:
             self._transport.write(failure(None, refusal) + b"\n")
             self._transport.close()
             return
-        self._bucket = Bucket(self.door.options.rate, self.door.now())
+        self._bucket = TokenBucket(self.door.options.rate, self.door.now())
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._closed = True
@@ -152,7 +152,7 @@ class Connection(asyncio.Protocol):
             elif line.strip():
                 self._lines.append(line)
                 self._waiting += len(line) + OVERHEAD
-        if self._waiting > MOST_WAITING and not self._resting:
+        if self._waiting > MAX_WAITING and not self._resting:
             self._resting = True
             self._transport.pause_reading()
         self._work()
@@ -160,7 +160,7 @@ class Connection(asyncio.Protocol):
     # Its share of the loop
 
     def _work(self) -> None:
-        if self._lines and not (self._working or self._closed or self.blocked or len(self._tasks) >= MOST_TASKS):
+        if self._lines and not (self._working or self._closed or self.blocked or len(self._tasks) >= MAX_TASKS):
             self._working = True
             more = True
             while more and self.door.work.at_once():  # goals that came together leave together
@@ -176,14 +176,14 @@ class Connection(asyncio.Protocol):
         line = self._lines.popleft()
         self._waiting -= len(line) + OVERHEAD
         self._do(line)
-        if self._resting and self._waiting <= MOST_WAITING // 2 and not self._closed:
+        if self._resting and self._waiting <= MAX_WAITING // 2 and not self._closed:
             self._resting = False
             self._transport.resume_reading()
         wait = self._bucket.take(self.door.now())
         if wait:
             self.door.loop.call_later(wait, self._go_on)  # it stays `working`: nothing else begins its next turn
             return False
-        self._working = bool(self._lines) and not (self.blocked or len(self._tasks) >= MOST_TASKS)
+        self._working = bool(self._lines) and not (self.blocked or len(self._tasks) >= MAX_TASKS)
         self._leave_if_done()
         return self._working
 

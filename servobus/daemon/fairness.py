@@ -14,7 +14,7 @@ BUDGET = 0.001
 """Seconds of one pass."""
 
 
-class Work:
+class FairShare:
     """Turns are callables that do one piece and return whether there is more."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, now: Callable[[], float] = perf_counter) -> None:
@@ -56,7 +56,7 @@ class Work:
         self._due = False
 
 
-class Bucket:
+class TokenBucket:
     """Tokens of one client. Pure."""
 
     def __init__(self, rate: float | None, now: float) -> None:

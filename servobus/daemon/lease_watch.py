@@ -15,7 +15,7 @@ log = structlog.get_logger("servobus")
 STOPPING = "the client that moved it is gone, and it is being stopped: wait a moment"
 
 
-class Leasing:
+class LeaseWatch:
     """One for each door. Times are the loop's."""
 
     def __init__(self, rig: LocalRig, ttl: float) -> None:

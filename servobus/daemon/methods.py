@@ -81,13 +81,13 @@ def _bus_free(client: Connection, bus: str) -> None:
 
 def move(client: Connection, params: rpc.Move) -> LATER:
     _moved(client, params.positions)
-    keys = {key: getattr(params, key) for key in ("together", "confirm", "speed", "duration", "deadline")}
+    keys = {key: getattr(params, key) for key in ("together", "confirm", "speed", "duration", "start_within")}
     return client.door.rig.move(params.positions, **keys)
 
 
 def move_to(client: Connection, params: rpc.MoveTo) -> LATER:
     _moved(client, [params.name])
-    keys = {key: getattr(params, key) for key in ("speed", "duration", "acceleration", "effort", "deadline", "confirm")}
+    keys = {key: getattr(params, key) for key in ("speed", "duration", "acceleration", "effort", "start_within", "confirm")}
     return client.door.rig[params.name].move_to(params.position, **keys)
 
 

@@ -14,8 +14,8 @@ import structlog
 
 from servobus.config.access import Role
 from servobus.daemon.connection import Connection
-from servobus.daemon.fairness import Work
-from servobus.daemon.lease_watch import Leasing
+from servobus.daemon.fairness import FairShare
+from servobus.daemon.lease_watch import LeaseWatch
 from servobus.daemon.sockets import BACKLOG, Tokens, claim, inode, peer_credentials, remove, tls_context
 from servobus.daemon.subscriptions import Subscriptions
 from servobus.errors import ConfigError, Overloaded, ServobusError
@@ -40,8 +40,8 @@ class NativeDoor:
         self.handshake = handshake
         self.loop = asyncio.get_running_loop()
         self.now = self.loop.time
-        self.work = Work(self.loop)
-        self.leasing: Leasing = Leasing(rig, self.options.lease_ms / 1000)
+        self.work = FairShare(self.loop)
+        self.leasing: LeaseWatch = LeaseWatch(rig, self.options.lease_ms / 1000)
         self.subscriptions: Subscriptions = Subscriptions(rig)
         self.addresses: list[str] = []
         """Where it listens, for people."""

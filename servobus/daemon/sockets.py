@@ -21,7 +21,7 @@ GROUP = "servobus"
 """Its members may open the socket, where the system has such a group."""
 FOLDER_MODE, SOCKET_UMASK = 0o750, 0o117
 CREDENTIALS = struct.Struct("3i")
-LEAST_TOKEN = 32
+MIN_TOKEN = 32
 TRIES, WINDOW = 5, 60.0
 """Wrong tokens of one address in so many seconds; then it waits that long."""
 BACKLOG = 1024
@@ -139,8 +139,8 @@ def read_token(path: Path) -> bytes:
         if not stat.S_ISREG(mode) or mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise ConfigError(f"door.tcp.token_file {path} can be read by others: chmod 600 {path}")
         token = file.read(4096).strip()
-    if len(token) < LEAST_TOKEN:
-        raise ConfigError(f"door.tcp.token_file {path} holds fewer than {LEAST_TOKEN} characters: make it longer")
+    if len(token) < MIN_TOKEN:
+        raise ConfigError(f"door.tcp.token_file {path} holds fewer than {MIN_TOKEN} characters: make it longer")
     return token
 
 

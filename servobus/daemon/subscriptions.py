@@ -15,7 +15,7 @@ from servobus.daemon.jsonrpc import encode, notification
 from servobus.errors import NotSupported, Overloaded, UnknownName
 from servobus.rig.events import Event
 from servobus.rig.local import LocalRig
-from servobus.rpc.methods import LEAST_HZ, MAX_SUBSCRIPTIONS, MOST_HZ, Subscribe
+from servobus.rpc.methods import MAX_HZ, MAX_SUBSCRIPTIONS, MIN_HZ, Subscribe
 from servobus.values import State
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ class Subscriptions:
         """Raises NotSupported, UnknownName, Overloaded."""
         if params.topic not in TOPICS:
             raise NotSupported(f"no topic {params.topic!r}: there are {', '.join(TOPICS)}")
-        if not LEAST_HZ <= params.hz <= MOST_HZ:
-            raise NotSupported(f"{params.hz:g} Hz is outside {LEAST_HZ:g} to {MOST_HZ:g}")
+        if not MIN_HZ <= params.hz <= MAX_HZ:
+            raise NotSupported(f"{params.hz:g} Hz is outside {MIN_HZ:g} to {MAX_HZ:g}")
         if unknown := set(params.fields) - FIELDS:
             raise UnknownName(f"no field {', '.join(sorted(unknown))}: there are {', '.join(State.__dataclass_fields__)}")
         mine = self._of.setdefault(client, {})

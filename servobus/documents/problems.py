@@ -1,6 +1,6 @@
-"""What is wrong in a file, each complaint at its place: `file:line:column: key.path: what was found; what was expected`.
+"""What is wrong in a file, each problem at its place: `file:line:column: key.path: what was found; what was expected`.
 
-pydantic says what does not fit; the YAML document says where that stands. All complaints of a file are told at once, the first in
+pydantic says what does not fit; the YAML document says where that stands. All problems of a file are told at once, the first in
 the file first, and none repeats more of the input than a few words.
 """
 
@@ -18,7 +18,7 @@ from servobus.errors import ConfigError
 Entry: TypeAlias = Mapping[str, Any]
 """What pydantic says of one mistake: type, loc, msg, input, ctx."""
 MOST = 20
-"""Complaints that are told; a file with more is some other file."""
+"""Problems that are told; a file with more is some other file."""
 EXPECTED = {
     "Input should be a valid tuple": "expected a list",
     "Input should be ": "expected ",
@@ -31,7 +31,7 @@ EXPECTED = {
 """pydantic's words -> ours."""
 
 
-class Complaints:
+class Problems:
     """Collects what is wrong in one document."""
 
     def __init__(self, document: Document) -> None:
@@ -97,23 +97,23 @@ class Complaints:
 
     def _no_text(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
         if entry["loc"][-1] == "[key]":
-            self.add(path, f"found {show(entry['input'])} as a name; put it in quotes", key=True)
+            self.add(path, f"found {quote(entry['input'])} as a name; put it in quotes", key=True)
         else:
             self.add(path, f"{_found(entry)}expected text; a number stands in quotes", key=_is_section(entry))
 
 
-RULES: dict[str, Callable[[Complaints, type[BaseModel], Entry, KeyPath], None]] = {
-    "extra_forbidden": Complaints._unknown_key,
-    "missing": Complaints._missing_key,
-    "model_type": Complaints._no_section,
-    "dict_type": Complaints._no_section,
-    "too_long": Complaints._wrong_number,
-    "too_short": Complaints._wrong_number,
-    "string_type": Complaints._no_text,
+RULES: dict[str, Callable[[Problems, type[BaseModel], Entry, KeyPath], None]] = {
+    "extra_forbidden": Problems._unknown_key,
+    "missing": Problems._missing_key,
+    "model_type": Problems._no_section,
+    "dict_type": Problems._no_section,
+    "too_long": Problems._wrong_number,
+    "too_short": Problems._wrong_number,
+    "string_type": Problems._no_text,
 }
 
 
-def sound_part(kind: type[BaseModel], data: Mapping[Any, Any]) -> Any:
+def valid_subset(kind: type[BaseModel], data: Mapping[Any, Any]) -> Any:
     """The model of what is left when everything that does not fit is taken out, so that the rest can be looked at in the same
     go; None when the rest does not stand alone."""
     try:
@@ -138,7 +138,7 @@ def _is_section(entry: Entry) -> bool:
 
 def _found(entry: Entry) -> str:
     """Nothing for a whole section: its place says enough."""
-    return "" if _is_section(entry) else f"found {show(entry['input'])}; "
+    return "" if _is_section(entry) else f"found {quote(entry['input'])}; "
 
 
 def fields_at(kind: type[BaseModel], loc: KeyPath) -> list[str]:
@@ -164,7 +164,7 @@ def dotted(path: KeyPath) -> str:
     return ".".join(clip(str(part), 40) for part in path)
 
 
-def show(value: Any) -> str:
+def quote(value: Any) -> str:
     """A value as it is written, cut to a few words."""
     if value is None:
         return "nothing"

@@ -1,6 +1,6 @@
 """YAML that people write and strangers may send: a safe subset, read within limits, with the place of every value.
 
-Everything the project reads from YAML goes through here, so that each complaint can name `file:line:column`. Two rules hold for
+Everything the project reads from YAML goes through here, so that each problem can name `file:line:column`. Two rules hold for
 the file: what the text alone shows is refused before the parser sees it, because the parser's time and memory are not bounded
 by the text's length; and no more of the input than a few words ever stands in an error.
 
@@ -198,7 +198,7 @@ class _Builder:
         return Document(data, self.name, self.places)
 
     def _next(self) -> Event | None:
-        """The next event; the parser's own complaints in our words."""
+        """The next event; the parser's own problems in our words."""
         try:
             event: Event | None = next(self.events, None)
         except MarkedYAMLError as error:

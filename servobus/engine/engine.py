@@ -81,7 +81,7 @@ class Runner:
             if self._suspended is not None and not estop:
                 self._run, self._suspended = self._suspended, None
                 return self._run
-            job = self.scheduler.next_turn(now)
+            job = self.scheduler.next_job(now)
             if job is None:
                 return None
             run = Run(job, estop=estop)

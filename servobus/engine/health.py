@@ -13,14 +13,14 @@ from enum import StrEnum
 
 FIRST_DEADLINE = 0.020
 """Seconds allowed to a node nobody has heard yet, beyond the wire time."""
-LEAST_DEADLINE = 0.005
+MIN_DEADLINE = 0.005
 """A host is not punctual: below this a busy machine would look like a silent servo."""
-GREATEST_DEADLINE = 0.100
+MAX_DEADLINE = 0.100
 OFFLINE_AFTER = 3
 """Misses in a row."""
 FIRST_BACKOFF = 0.050
-GREATEST_BACKOFF = 3.2
-MOST_OUTSTANDING = 64
+MAX_BACKOFF = 3.2
+MAX_OUTSTANDING = 64
 
 
 class Condition(StrEnum):
@@ -80,7 +80,7 @@ class Node:
             self._mean += error / 8
             self._spread += (abs(error) - self._spread) / 4
         wanted = self._mean + 4 * self._spread
-        self._deadline = min(max(wanted, LEAST_DEADLINE), self.greatest_deadline)
+        self._deadline = min(max(wanted, MIN_DEADLINE), self.greatest_deadline)
 
     def answered(self, status: int | None) -> None:
         """It gave an answer that was believed."""
@@ -91,7 +91,7 @@ class Node:
         """A reply of this look may still come, or came once too often."""
         self.outstanding.pop(key, None)
         self.outstanding[key] = asked_at
-        if len(self.outstanding) > MOST_OUTSTANDING:
+        if len(self.outstanding) > MAX_OUTSTANDING:
             del self.outstanding[next(iter(self.outstanding))]
         if self.condition is Condition.ONLINE:
             self.condition = Condition.DOUBTFUL
@@ -107,7 +107,7 @@ class Node:
             return
         self.condition = Condition.OFFLINE
         self._deadline = min(FIRST_DEADLINE, self.greatest_deadline)
-        self.backoff = min(2 * self.backoff, GREATEST_BACKOFF) if self.backoff else FIRST_BACKOFF
+        self.backoff = min(2 * self.backoff, MAX_BACKOFF) if self.backoff else FIRST_BACKOFF
         self.next_probe = now + self.backoff
 
     def late(self, key: Hashable, now: float) -> None:
@@ -137,7 +137,7 @@ class Health:
     """The nodes of one bus. `changed(node, before)` is told of every change of condition."""
 
     def __init__(
-        self, nodes: Collection[int], *, greatest_deadline: float = GREATEST_DEADLINE, changed: Callable[[Node, Condition], None]
+        self, nodes: Collection[int], *, greatest_deadline: float = MAX_DEADLINE, changed: Callable[[Node, Condition], None]
     ) -> None:
         self._greatest_deadline = greatest_deadline
         self._changed = changed

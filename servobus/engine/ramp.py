@@ -29,7 +29,7 @@ class Ramp:
     """When the next setpoint shall leave. None: the first was not delivered yet, or the last has left."""
 
 
-class Profile:
+class SetpointRamps:
     """The rows under way on one bus. `cut(servo, error)` is told of one that ends before its goal."""
 
     def __init__(self, hz: float, cut: Callable[[str, Exception], None]) -> None:

@@ -1,4 +1,4 @@
-"""Decides the next turn: e-stop, goals, requests, polls, probes. Pure: `next_turn(now)` returns a decision, the
+"""Decides the next turn: e-stop, goals, requests, polls, probes. Pure: `next_job(now)` returns a decision, the
 master acts on it.
 
 Two rules hold. A higher class goes first; and after each turn of a class, one turn of a lower class follows if any
@@ -18,9 +18,9 @@ from servobus.engine.coalescer import Coalescer, Group, Ticket
 from servobus.engine.health import Condition, Health, Node
 from servobus.engine.polls import PollGrid
 from servobus.engine.queue import Callback, Job, RequestQueue, overloaded
-from servobus.engine.ramp import Profile
+from servobus.engine.ramp import SetpointRamps
 from servobus.errors import DeviceError, ReplyTimeout, ServobusError
-from servobus.protocols.base import Driver, GoalTurn, Plan
+from servobus.protocols.base import Driver, GoalPlan, Plan
 from servobus.values import Outcome
 
 QUEUE_LIMIT = 1024
@@ -50,7 +50,7 @@ class Scheduler:
         self.driver = driver
         self.health = health
         self.coalescer = Coalescer()
-        self.profile = Profile(cycle, on_cut)
+        self.profile = SetpointRamps(cycle, on_cut)
         self.requests = RequestQueue(limit)
         self.estop: deque[Job] = deque()
         self.stops: deque[Job] = deque()
@@ -101,7 +101,7 @@ class Scheduler:
 
     # The decision
 
-    def next_turn(self, now: float) -> Job | None:
+    def next_job(self, now: float) -> Job | None:
         """What shall be on the wire next; None: nothing yet, see `wake`."""
         if now >= self._parked_until:  # on a busy line nobody calls `expire`
             self._end_parked(now)
@@ -237,7 +237,7 @@ class Scheduler:
             if group is None:
                 return False
             try:
-                turns = self.driver.plan(
+                turns = self.driver.plan_goals(
                     [ticket.goal for ticket in group.tickets], together=group.together, confirm=group.confirm
                 )
             except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its goals, never the bus
@@ -250,7 +250,7 @@ class Scheduler:
         return False
 
     @staticmethod
-    def _goal_job(turn: GoalTurn, group: Group) -> tuple[Job, list[Ticket]]:
+    def _goal_job(turn: GoalPlan, group: Group) -> tuple[Job, list[Ticket]]:
         tickets = [ticket for ticket in group.tickets if ticket.servo in turn.servos]
         expires = max(ticket.expires for ticket in tickets)
         sink = Callback(lambda result: _settle(tickets, result))
@@ -280,7 +280,7 @@ class Scheduler:
 
     def recovery(self, node: Node) -> Plan[bool]:
         """The fence, and whether the servo still is as we left it. What makes a doubtful node believed again."""
-        kept = yield from self.driver.recover(node.id, list(node.outstanding), node.enabled)
+        kept = yield from self.driver.fence(node.id, list(node.outstanding), node.enabled)
         if not kept:
             self._on_restart(node)
         self.health.recovered(node)

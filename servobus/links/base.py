@@ -16,7 +16,7 @@ class Transport(Protocol):
     def write(self, data: bytes) -> None:
         """Queue bytes; never blocks, never raises. `data_received` is never called from within."""
 
-    def look(self) -> bool:
+    def poll_input(self) -> bool:
         """Hand over now what already arrived; before a deadline is declared missed. False: this link cannot look."""
 
     def set_baudrate(self, baudrate: int) -> None:

@@ -17,7 +17,7 @@ from servobus.protocols.options import FaultOptions
 Rename = Callable[[bytes, random.Random], bytes]
 Damage = Callable[[bytes, random.Random], bytes]
 
-MOST_NOISE = 3
+MAX_NOISE = 3
 """Zero bytes before a reply: what a line without bias resistors shows."""
 LONGEST_PIECE = 5
 
@@ -44,7 +44,7 @@ DAMAGES: dict[str, Damage] = {
     "insert_byte": _insert_byte,
     "flip": _flip,
     "duplicate": lambda frame, rng: frame + frame,
-    "noise": lambda frame, rng: bytes(rng.randint(1, MOST_NOISE)) + frame,
+    "noise": lambda frame, rng: bytes(rng.randint(1, MAX_NOISE)) + frame,
 }
 """Fault -> what is left of the frame, in the order in which they strike."""
 

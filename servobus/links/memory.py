@@ -64,7 +64,7 @@ class MemoryTransport(asyncio.Transport):
         if not self._closing:
             self._protocol.data_received(data)
 
-    def look(self) -> bool:
+    def poll_input(self) -> bool:
         """There is nowhere to look: what was said is delivered by the loop."""
         return False
 

@@ -250,7 +250,7 @@ class RealmanTransport(asyncio.Protocol):
         if self._timer is not None:
             self._timer.cancel()
 
-    def look(self) -> bool:
+    def poll_input(self) -> bool:
         """The loop reads the socket."""
         return False
 

@@ -22,7 +22,7 @@ from servobus.links.tty import check_device, explain, is_pty
 from servobus.protocols.base import LineTraits
 
 CHUNK = 4096
-MOST_UNSENT = 64 * 1024
+MAX_UNSENT = 64 * 1024
 """Bytes that may wait for room in the kernel's buffer; a port that takes none for so long is gone."""
 USB_LATENCY = 0.002
 """Seconds an adapter may sit on a reply. FTDI's own default is 16 ms, and low latency mode (asked for at open) makes it 1."""
@@ -115,10 +115,10 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
             self._say(data)
         else:
             self._held += data
-        if self.get_write_buffer_size() > MOST_UNSENT:
+        if self.get_write_buffer_size() > MAX_UNSENT:
             self._lose(OSError(errno.ENOBUFS, "it takes no more bytes"))
 
-    def look(self) -> bool:
+    def poll_input(self) -> bool:
         """Read what is there now."""
         if not self._closing:
             self._read_ready()

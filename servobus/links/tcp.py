@@ -15,7 +15,7 @@ from servobus.protocols.base import LineTraits
 CONNECT_TIMEOUT = 2.0
 LATENCY = 0.020
 """Seconds a server may collect bytes before it sends them on."""
-MOST_UNSENT = 64 * 1024
+MAX_UNSENT = 64 * 1024
 """Bytes that may wait for the server; one that takes none for so long is gone."""
 OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
@@ -91,11 +91,11 @@ class TcpTransport(asyncio.Protocol):
         if self._socket.is_closing():
             return
         self._socket.write(data)
-        if self._socket.get_write_buffer_size() > MOST_UNSENT:
+        if self._socket.get_write_buffer_size() > MAX_UNSENT:
             self._error = LinkDown(f"{self._address} takes no more bytes: is the server alive?")
             self._socket.abort()
 
-    def look(self) -> bool:
+    def poll_input(self) -> bool:
         """The loop reads the socket."""
         return False
 

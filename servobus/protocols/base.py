@@ -154,7 +154,7 @@ def run_plan(plan: Plan[R], exchange: Callable[[Request[Any]], Any]) -> R:
 
 
 @dataclass(frozen=True, slots=True)
-class GoalTurn:
+class GoalPlan:
     """What the wire sees of some goals: one uninterrupted plan that ends in an outcome or an error per servo."""
 
     servos: tuple[str, ...]
@@ -201,7 +201,7 @@ class Driver(Protocol):
     def commissioning(self) -> Commissioning | None:
         """None: this protocol's servos are given ids and rates with other tools."""
 
-    def carries(self, traits: LineTraits) -> None:
+    def use_traits(self, traits: LineTraits) -> None:
         """What the line carries, told before it is spoken on."""
 
     def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError] | None:
@@ -216,7 +216,7 @@ class Driver(Protocol):
     def unused(self) -> Request[Any]:
         """A question nobody answers, to hear whether the line echoes."""
 
-    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         """Fence: ask what cannot be mistaken for any reply in `avoid` (oldest first). False: a servo of the node lost
         what enable() wrote, so it has restarted (asked only when `enabled`)."""
 
@@ -250,10 +250,10 @@ class Driver(Protocol):
     def check_goal(self, goal: ServoGoal) -> None:
         """Raise LimitError or NotSupported for what the model or the wire cannot carry."""
 
-    def pace(self, goal: ServoGoal) -> float | None:
+    def host_speed(self, goal: ServoGoal) -> float | None:
         """The speed (unit/s) that the host must keep on the way to this goal; None: the servo's own, or none at all."""
 
-    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
+    def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
         """The fewest turns that carry these goals; with `together` one turn. Raises NotSupported."""
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
@@ -263,7 +263,7 @@ class Driver(Protocol):
 class PlainDriver:
     """What drivers share whose frames fit every line, and whose servos tell in their refusal all they know."""
 
-    def carries(self, traits: LineTraits) -> None:
+    def use_traits(self, traits: LineTraits) -> None:
         """Whatever it carries."""
 
     def explain(self, servo: str, error: DeviceError) -> None:

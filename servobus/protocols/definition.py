@@ -19,7 +19,7 @@ def one_servo(node: int, model: str) -> dict[str, dict[str, Any]]:
 
 
 @dataclass(frozen=True, slots=True)
-class ProtocolEntry:
+class ProtocolDefinition:
     """The parts of one protocol. `options` below is always an instance of its own options class."""
 
     options: type[BusOptions]

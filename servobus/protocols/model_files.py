@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from servobus.documents import reader
-from servobus.documents.problems import Complaints, show
+from servobus.documents.problems import Problems, quote
 from servobus.errors import ConfigError
 from servobus.protocols.model import ServoModel
 
@@ -42,22 +42,22 @@ class ModelFiles(Generic[M]):
     def read(self, path: Path) -> M:
         """The model in a file. Raises ConfigError with the places of what is wrong."""
         document = reader.read(path)
-        complaints = Complaints(document)
+        problems = Problems(document)
         data = document.data
         if isinstance(data, dict) and "extends" in data:
-            data = self._extended(data, complaints)
-        model = complaints.validated(self._kind, data, ())
-        complaints.raise_any()
+            data = self._extended(data, problems)
+        model = problems.validated(self._kind, data, ())
+        problems.raise_any()
         assert isinstance(model, self._kind)
         return model
 
-    def _extended(self, data: Mapping[str, Any], complaints: Complaints) -> Any:
+    def _extended(self, data: Mapping[str, Any], problems: Problems) -> Any:
         """The packaged model of that name, with what this file says instead."""
         base = data["extends"]
         known = [path.stem for path in sorted(self.folder.glob(f"*{SUFFIX}"))]
         if base not in known:
-            complaints.add(("extends",), f"found {show(base)}; there are {', '.join(known)}")
-            complaints.raise_any()
+            problems.add(("extends",), f"found {quote(base)}; there are {', '.join(known)}")
+            problems.raise_any()
         if base not in self._data:  # it takes long to read
             self._data[base] = reader.read(self.folder / f"{base}{SUFFIX}").data
         return merged(self._data[base], {key: value for key, value in data.items() if key != "extends"})

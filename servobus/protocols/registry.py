@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from servobus.protocols import kst, roh, sms
-from servobus.protocols.definition import ProtocolEntry
+from servobus.protocols.definition import ProtocolDefinition
 
-PROTOCOLS: dict[str, ProtocolEntry] = {
-    "sms": sms.ENTRY,
-    "kst": kst.ENTRY,
-    "roh": roh.ENTRY,
+PROTOCOLS: dict[str, ProtocolDefinition] = {
+    "sms": sms.DEFINITION,
+    "kst": kst.DEFINITION,
+    "roh": roh.DEFINITION,
 }

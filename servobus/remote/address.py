@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from servobus.errors import AccessDenied, ConfigError, LinkDown
-from servobus.remote.connection import Wire
+from servobus.remote.connection import Connection
 from servobus.rpc.socket_path import find_socket, socket_path
 
 CONNECT_TIMEOUT = 5.0
@@ -31,7 +31,7 @@ class Address:
     def __str__(self) -> str:
         return str(self.path) if self.path else f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
-    async def dial(self, wire: Callable[[], Wire]) -> Wire:
+    async def dial(self, wire: Callable[[], Connection]) -> Connection:
         """A connection. Raises LinkDown, AccessDenied."""
         loop = asyncio.get_running_loop()
         try:

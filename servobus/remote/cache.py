@@ -17,7 +17,7 @@ def received(state: State, now: float) -> State:
     return replace(state, time=None if state.age is None else now - state.age)
 
 
-class Mirror:
+class StateCache:
     """Filled by every connection anew; `down` while there is none."""
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class Mirror:
         return self._stats
 
 
-class Newest:
+class LatestSnapshot:
     """A place for one snapshot: what was not fetched is replaced."""
 
     def __init__(self) -> None:

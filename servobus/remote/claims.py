@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 
-class Claims:
+class HeldLeases:
     """By full servo name."""
 
     def __init__(self) -> None:

@@ -62,11 +62,14 @@ def _result(method: str) -> Callable[[bytes], Any]:
     return msgspec.json.Decoder(METHODS[method].result).decode
 
 
-class Wire(asyncio.Protocol):
+class Connection(asyncio.Protocol):
     """`notice(method, params)` hears what comes unasked; `lost(wire, why)` is called once, when the connection is no more."""
 
     def __init__(
-        self, place: str, notice: Callable[[str, msgspec.Raw], None], lost: Callable[[Wire, LinkDown], None] = lambda *_: None
+        self,
+        place: str,
+        notice: Callable[[str, msgspec.Raw], None],
+        lost: Callable[[Connection, LinkDown], None] = lambda *_: None,
     ) -> None:
         self.place = place
         self.down: LinkDown | None = None

@@ -14,13 +14,13 @@ from typing import Any
 import msgspec
 
 from servobus.errors import LinkDown, ServobusError
-from servobus.remote.cache import Mirror, Newest, received
-from servobus.remote.connection import Wire
-from servobus.remote.leases import Holding
+from servobus.remote.cache import LatestSnapshot, StateCache, received
+from servobus.remote.connection import Connection
+from servobus.remote.leases import ClientLeases
 from servobus.remote.session import DEADLINE, Dial, Session
 from servobus.rig.events import Announcer, Event, Feed
 from servobus.rig.interface import Found, Rig, Snapshot
-from servobus.rpc.methods import LEAST_HZ, MOST_HZ, Greeting
+from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
 
 SHORTEST_LEASE = 0.1
 """Seconds; no daemon makes us renew more often than that asks for."""
@@ -32,17 +32,17 @@ class Listening(Rig):
     """A rig that the other end tells about."""
 
     def __init__(self, place: str, dial: Dial, hello: Callable[[], dict[str, Any]], refresh_hz: float) -> None:
-        self._mirror = Mirror()
+        self._cache = StateCache()
         self._announcer = Announcer()
         self._session = Session(place, dial, hello, self._greeted, self._know, self._changed, self._progressed)
-        self._holding = Holding(self._session)
+        self._leases = ClientLeases(self._session)
         self._refresh_hz = refresh_hz
         self._clock = asyncio.get_running_loop().time
         self._renaming: asyncio.Task[None] | None = None
         self._hears_events = False
         self._subscribing = asyncio.Lock()
         self._scanning: dict[str, Callable[[int, int, Found | None], None]] = {}
-        self._watching: set[Newest] = set()
+        self._watching: set[LatestSnapshot] = set()
         self.greeting: Greeting | None = None
         """What the daemon said of itself last."""
 
@@ -50,27 +50,27 @@ class Listening(Rig):
 
     async def start(self) -> None:
         self._session.want({"topic": "state", "hz": self._refresh_hz}, self._seen)
-        self._session.want({"topic": "stats", "hz": 1.0}, lambda told: self._mirror.counted(told["stats"]))
+        self._session.want({"topic": "stats", "hz": 1.0}, lambda told: self._cache.counted(told["stats"]))
         await self._session.connect()
 
     def _greeted(self, greeting: Greeting) -> None:
         self.greeting = greeting
-        self._holding.begin(max(greeting.lease_ms / 1000, SHORTEST_LEASE))
-        self._mirror.names, self._mirror.stopped = greeting.names, greeting.stopped
+        self._leases.begin(max(greeting.lease_ms / 1000, SHORTEST_LEASE))
+        self._cache.names, self._cache.stopped = greeting.names, greeting.stopped
 
-    async def _know(self, wire: Wire) -> None:
+    async def _know(self, wire: Connection) -> None:
         """A connection is there: what `snapshot` and `stats` have to say."""
         await asyncio.gather(
             wire.call("snapshot", {}, timeout=DEADLINE, then=self._learnt),
-            wire.call("stats", {}, timeout=DEADLINE, then=self._mirror.counted),
+            wire.call("stats", {}, timeout=DEADLINE, then=self._cache.counted),
         )
 
     def _changed(self, lost: LinkDown | None) -> None:
         """The connection is there, or no more."""
-        was, self._mirror.down = self._mirror.down, lost
+        was, self._cache.down = self._cache.down, lost
         if lost is not None:
             for newest in self._watching:
-                newest.put(self._mirror.snapshot(self._clock()))
+                newest.put(self._cache.snapshot(self._clock()))
             self._announcer.tell(Event("daemon_lost", self._clock(), {"reason": lost.message}))
         elif was is not None:
             self._announcer.tell(Event("daemon_back", self._clock()))
@@ -80,7 +80,7 @@ class Listening(Rig):
         if self._renaming is not None:
             self._renaming.cancel()
         try:
-            await self._holding.end(lost=lost)
+            await self._leases.end(lost=lost)
         finally:
             await self._session.close(lost=lost)
 
@@ -92,39 +92,39 @@ class Listening(Rig):
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
-        return self._mirror.names
+        return self._cache.names
 
     @property
     def stopped(self) -> bool:
         """As last heard; while there is no connection, nobody knows."""
-        return self._mirror.stopped
+        return self._cache.stopped
 
     def snapshot(self) -> Snapshot:
         """Not older than `refresh_hz` allows. While there is no connection: the last, with its age, and offline."""
-        return self._mirror.snapshot(self._clock())
+        return self._cache.snapshot(self._clock())
 
     def stats(self) -> dict[str, Any]:
         """About a second old at most. Raises LinkDown while there is no connection."""
-        return self._mirror.stats()
+        return self._cache.stats()
 
     def _learnt(self, states: Snapshot) -> Snapshot:
         """At the moment they come, so that nothing newer is replaced."""
         now = self._clock()
         states = {name: received(state, now) for name, state in states.items()}
-        self._mirror.know(states)
+        self._cache.know(states)
         return states
 
     def _seen(self, told: dict[str, Any]) -> Snapshot:
         """A state notice."""
         states = self._learnt(msgspec.convert(told["states"], Snapshot))
-        self._mirror.stopped = bool(told["stopped"])
-        if states.keys() != self._mirror.names.keys() and (self._renaming is None or self._renaming.done()):
+        self._cache.stopped = bool(told["stopped"])
+        if states.keys() != self._cache.names.keys() and (self._renaming is None or self._renaming.done()):
             self._renaming = asyncio.create_task(self._rename())  # the config was read anew
         return states
 
     async def _rename(self) -> None:
         with suppress(ServobusError):  # the next notice asks again
-            self._mirror.names = await self._session.call("names", {})
+            self._cache.names = await self._session.call("names", {})
 
     async def _refresh(self) -> None:
         """After a verb that has changed what all may see."""
@@ -134,18 +134,18 @@ class Listening(Rig):
     async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
         """Snapshots as the daemon sends them, at most 200 a second; a slow reader gets fewer, never old ones. When the
         connection is lost there is one with every servo offline, and when it is back they go on."""
-        if not LEAST_HZ <= hz <= 1000:
+        if not MIN_HZ <= hz <= 1000:
             async for snapshot in super().watch(hz):
                 yield snapshot
-        newest = Newest()
+        newest = LatestSnapshot()
         subscription = await self._session.subscribe(
-            {"topic": "state", "hz": min(hz, MOST_HZ)}, lambda told: newest.put(self._seen(told))
+            {"topic": "state", "hz": min(hz, MAX_HZ)}, lambda told: newest.put(self._seen(told))
         )
         self._watching.add(newest)
         try:
             yield self.snapshot()
             while True:
-                yield self._mirror.aged(await newest.get(), self._clock())
+                yield self._cache.aged(await newest.get(), self._clock())
         finally:
             self._watching.discard(newest)
             self._session.unsubscribe(subscription)

@@ -19,7 +19,7 @@ from servobus.remote.address import address_of, token_of
 from servobus.remote.listener import Listening
 from servobus.remote.session import DEADLINE
 from servobus.rig.interface import Found, Reload, Snapshot
-from servobus.rpc.methods import LEAST_HZ, MOST_HZ
+from servobus.rpc.methods import MAX_HZ, MIN_HZ
 from servobus.values import GOAL_NUMBERS, Change, Goal, Identity, Outcome, State, StopReport, is_number, no_number
 
 T = TypeVar("T")
@@ -40,8 +40,8 @@ async def connect(
     what others read when this client holds a servo. `tls`: True, the PEM file that signs the daemon's certificate, or a context.
     Left normally, motion goes on to its end; left by an exception, the servos moved from here do their `on_lost_client`.
     Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
-    if not LEAST_HZ <= refresh_hz <= MOST_HZ:
-        raise ValueError(f"connect: refresh_hz {refresh_hz} is outside {LEAST_HZ:g} to {MOST_HZ:g}")
+    if not MIN_HZ <= refresh_hz <= MAX_HZ:
+        raise ValueError(f"connect: refresh_hz {refresh_hz} is outside {MIN_HZ:g} to {MAX_HZ:g}")
     address = address_of(place, tls)
     rig = RemoteRig(str(address), address.dial, lambda: {"client": name, "token": token_of(token, token_file)}, refresh_hz)
     try:
@@ -68,7 +68,7 @@ class RemoteRig(Listening):
         if not full:
             return {}
         params = {"goals": {name: asdict(goal) for name, goal in full.items()}, "together": together, "confirm": confirm}
-        outcomes: dict[str, Outcome] = await self._holding.move("send_all", full, params, lambda told: _about(full, told))
+        outcomes: dict[str, Outcome] = await self._leases.move("send_all", full, params, lambda told: _about(full, told))
         return outcomes
 
     def _checked(self, name: str, goal: Goal) -> Goal:
@@ -85,10 +85,10 @@ class RemoteRig(Listening):
         return replace(goal, **numbers)
 
     async def acquire(self, *names: str) -> None:
-        await self._holding.acquire(self.full_names(names))
+        await self._leases.acquire(self.full_names(names))
 
     async def release(self, *names: str) -> None:
-        await self._holding.release(self.full_names(names))
+        await self._leases.release(self.full_names(names))
 
     async def enable(self, *names: str) -> None:
         await self._do("enable", {"names": self.full_names(names)})
@@ -98,7 +98,7 @@ class RemoteRig(Listening):
 
     async def stop(self) -> dict[str, StopReport]:
         def latched(reports: dict[str, StopReport]) -> dict[str, StopReport]:
-            self._mirror.stopped = True
+            self._cache.stopped = True
             return reports
 
         reports: dict[str, StopReport] = await self._do("stop", {}, then=latched)
@@ -106,7 +106,7 @@ class RemoteRig(Listening):
 
     async def clear(self) -> None:
         def released(_: None) -> None:
-            self._mirror.stopped = False
+            self._cache.stopped = False
 
         await self._do("clear", {}, then=released)
 

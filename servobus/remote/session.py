@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 
 from servobus.errors import LinkDown, NotSupported, ReplyTimeout, ServobusError
-from servobus.remote.connection import Wire
+from servobus.remote.connection import Connection
 from servobus.rpc.methods import PROTOCOL, Greeting
 
-FIRST_DELAY, MOST_DELAY = 0.05, 2.0
+FIRST_DELAY, MAX_DELAY = 0.05, 2.0
 """Seconds between two tries to get the connection back."""
 GREETING_TIMEOUT = 5.0
 SILENCE = 5.0
@@ -22,7 +22,7 @@ DEADLINES = {"scan": 30.0, "set_id": 30.0, "set_baudrate": 30.0, "reload": 60.0}
 """Seconds an answer may take, where that is more than DEADLINE; `scan` from one `progress` to the next."""
 DEADLINE = 10.0
 
-Dial = Callable[[Callable[[], Wire]], Awaitable[Wire]]
+Dial = Callable[[Callable[[], Connection]], Awaitable[Connection]]
 _notice = msgspec.json.Decoder(dict[str, Any]).decode
 
 
@@ -46,7 +46,7 @@ class Session:
         dial: Dial,
         hello: Callable[[], dict[str, Any]],
         greeted: Callable[[Greeting], None],
-        up: Callable[[Wire], Awaitable[None]],
+        up: Callable[[Connection], Awaitable[None]],
         changed: Callable[[LinkDown | None], None],
         progress: Callable[[dict[str, Any]], None],
     ) -> None:
@@ -57,7 +57,7 @@ class Session:
         self._up = up
         self._changed = changed
         self._progress = progress
-        self._wire: Wire | None = None
+        self._wire: Connection | None = None
         self._down = LinkDown(f"{place}: not connected yet")
         self._subscriptions: dict[Subscription, None] = {}
         """In the order they were made."""
@@ -68,7 +68,7 @@ class Session:
     async def connect(self) -> None:
         """The first time, or again. Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
         hello = self._hello()
-        wire = await self._dial(lambda: Wire(self.place, self._notice, self._lost))
+        wire = await self._dial(lambda: Connection(self.place, self._notice, self._lost))
         try:
             self._greeted(await self._greet(wire, hello))
             for subscription in tuple(self._subscriptions):
@@ -83,7 +83,7 @@ class Session:
         self._changed(None)
         self._watch()
 
-    async def _greet(self, wire: Wire, hello: dict[str, Any]) -> Greeting:
+    async def _greet(self, wire: Connection, hello: dict[str, Any]) -> Greeting:
         try:
             greeting: Greeting = await wire.call("hello", hello | {"protocol": PROTOCOL}, timeout=GREETING_TIMEOUT)
         except LinkDown as error:
@@ -109,7 +109,7 @@ class Session:
         """Raises LinkDown at once while there is no connection."""
         return await self._present().call(method, params, timeout=timeout or DEADLINES.get(method, DEADLINE), then=then)
 
-    def _present(self) -> Wire:
+    def _present(self) -> Connection:
         if self._wire is None:
             raise LinkDown(f"{self._down.message}; nothing was sent" + ("" if self._closed else ", it is tried again by itself"))
         return self._wire
@@ -137,7 +137,7 @@ class Session:
             self.unsubscribe(subscription)
 
     @staticmethod
-    async def _begin(wire: Wire, subscription: Subscription) -> None:
+    async def _begin(wire: Connection, subscription: Subscription) -> None:
         subscription.numbers.clear()
         await wire.call("subscribe", subscription.params, timeout=DEADLINE, then=subscription.numbers.add)
 
@@ -160,7 +160,7 @@ class Session:
 
     # The connection goes and comes
 
-    def _lost(self, wire: Wire, why: LinkDown) -> None:
+    def _lost(self, wire: Connection, why: LinkDown) -> None:
         if wire is not self._wire:
             return  # it never was in use
         self._wire, self._down = None, why
@@ -177,7 +177,7 @@ class Session:
                 return
             except Exception as error:  # noqa: BLE001 - whatever is wrong with this daemon, the next one may be right
                 self._down = LinkDown(error.message if isinstance(error, ServobusError) else f"{self.place}: {error}")
-            delay = min(2 * delay, MOST_DELAY)
+            delay = min(2 * delay, MAX_DELAY)
 
     def _watch(self) -> None:
         """A daemon that has nothing to say any more is lost, whatever the network says."""

@@ -76,15 +76,15 @@ class Servo:
         duration: float | None = None,
         acceleration: float | None = None,
         effort: float | None = None,
-        deadline: float | None = None,
+        start_within: float | None = None,
         confirm: bool = False,
     ) -> Outcome:
         """Hand a position over; returns when it was delivered, not when it has arrived (see `settle`). Seed 1.3.3, 1.3.4, 1.4.5.
 
-        `speed` in unit/s or `duration` in s; `effort` in % of the greatest torque; `deadline`: seconds until its first byte must
-        leave. Raises LimitError, NotEnabled, EStopped, LeaseHeld, GoalExpired; ReplyTimeout says it may have been applied.
+        `speed` in unit/s or `duration` in s; `effort` in % of the greatest torque; `start_within`: seconds until its first
+        byte must leave. Raises LimitError, NotEnabled, EStopped, LeaseHeld, GoalExpired, ReplyTimeout (it may have been applied).
         """
-        goal = Goal("position", position, speed, duration, acceleration, effort, deadline)
+        goal = Goal("position", position, speed, duration, acceleration, effort, start_within)
         return await self.rig.send(self.name, goal, confirm=confirm)
 
     async def spin(self, velocity: float, *, acceleration: float | None = None, effort: float | None = None) -> Outcome:
@@ -155,13 +155,13 @@ class Rig(ABC):
         confirm: bool = False,
         speed: float | None = None,
         duration: float | None = None,
-        deadline: float | None = None,
+        start_within: float | None = None,
     ) -> dict[str, Outcome]:
         """Positions for several servos. `together`: those of one bus start at the same moment; `confirm`: each acknowledged
         before any moves. All are checked before a byte is sent. Raises PartialFailure with the outcome of each, and what
         `move_to` raises.
         """
-        goals = {name: Goal("position", value, speed, duration, deadline=deadline) for name, value in positions.items()}
+        goals = {name: Goal("position", value, speed, duration, start_within=start_within) for name, value in positions.items()}
         return await self.send_all(goals, together=together, confirm=confirm)
 
     async def send(self, name: str, goal: Goal, *, confirm: bool = False) -> Outcome:

@@ -1,4 +1,4 @@
-"""LocalRig: the rig whose ports this process owns. What becomes of one bus stands in `keeper.py`."""
+"""LocalRig: the rig whose ports this process owns. What becomes of one bus stands in `supervisor.py`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from servobus.protocols.registry import PROTOCOLS
 from servobus.rig.events import Announcer, Event
 from servobus.rig.interface import Found, Reload, Rig, Snapshot
 from servobus.rig.results import outcomes, raise_failures
-from servobus.rig.supervisor import Keeper, Trace
+from servobus.rig.supervisor import BusSupervisor, Trace
 from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
 
 R = TypeVar("R")
@@ -33,7 +33,12 @@ class LocalRig(Rig):
     """Made by `servobus.open`, and alive as long as that context."""
 
     def __init__(
-        self, config: Config, keepers: TaskGroup, only: Collection[str] = (), trace: Trace | None = None, path: Path | None = None
+        self,
+        config: Config,
+        supervisors: TaskGroup,
+        only: Collection[str] = (),
+        trace: Trace | None = None,
+        path: Path | None = None,
     ) -> None:
         self.config = config
         self.path = path
@@ -43,19 +48,19 @@ class LocalRig(Rig):
         self.announcer = Announcer()
         self._only = only
         self._trace = trace
-        self._group = keepers
+        self._group = supervisors
         self._stopping: set[asyncio.Task[Any]] = set()
         self._reloading: asyncio.Task[Reload] | None = None
-        self.keepers = {name: self._keeper(name, config) for name in only or config.buses}
+        self.supervisors = {name: self._supervisor(name, config) for name in only or config.buses}
         self._know()
 
-    def _keeper(self, name: str, config: Config) -> Keeper:
-        return Keeper(name, config.buses[name], config.models[name], self._event, self._trace)
+    def _supervisor(self, name: str, config: Config) -> BusSupervisor:
+        return BusSupervisor(name, config.buses[name], config.models[name], self._event, self._trace)
 
     def _know(self) -> None:
-        """The names that go with the keepers."""
-        self.buses: dict[str, BusService] = {name: keeper.bus for name, keeper in self.keepers.items()}
-        self._names = {name: place for name, place in self.config.names.items() if place[0] in self.keepers}
+        """The names that go with the supervisors."""
+        self.buses: dict[str, BusService] = {name: supervisor.bus for name, supervisor in self.supervisors.items()}
+        self._names = {name: place for name, place in self.config.names.items() if place[0] in self.supervisors}
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
@@ -70,14 +75,14 @@ class LocalRig(Rig):
 
     async def start(self, *, degraded: bool) -> None:
         """Until every line was tried. Raises the first LinkDown, unless `degraded`."""
-        for keeper in self.keepers.values():
-            self._group.start_soon(keeper.run, degraded)
-        for keeper in self.keepers.values():
-            await keeper.tried.wait()
+        for supervisor in self.supervisors.values():
+            self._group.start_soon(supervisor.run, degraded)
+        for supervisor in self.supervisors.values():
+            await supervisor.tried.wait()
         if not degraded:
-            for name, keeper in self.keepers.items():
-                if keeper.down is not None:
-                    raise keeper.down.at(bus=name)
+            for name, supervisor in self.supervisors.items():
+                if supervisor.down is not None:
+                    raise supervisor.down.at(bus=name)
 
     async def acquire(self, *names: str) -> None:
         self.full_names(names)
@@ -97,42 +102,42 @@ class LocalRig(Rig):
     async def _reload(self, config: Config) -> Reload:
         await asyncio.gather(*self._stopping)
         wanted = [name for name in config.buses if not self._only or name in self._only]
-        kept = {name for name in self.keepers if name in wanted and config.has_same(name, self.config)}
-        gone = {name: keeper for name, keeper in self.keepers.items() if name not in kept}
+        kept = {name for name in self.supervisors if name in wanted and config.has_same(name, self.config)}
+        gone = {name: supervisor for name, supervisor in self.supervisors.items() if name not in kept}
         self.left.update(await self._leave(gone.values()))
         await asyncio.gather(*map(self._end, gone.values()))
         latched = self.stopped
         self.config = config
-        self.keepers = {name: self.keepers[name] if name in kept else self._keeper(name, config) for name in wanted}
+        self.supervisors = {name: self.supervisors[name] if name in kept else self._supervisor(name, config) for name in wanted}
         self._know()
         new = [name for name in wanted if name not in kept]
         for name in new:
             self.buses[name].motion.latched = latched
-            self._group.start_soon(self.keepers[name].run, True)
+            self._group.start_soon(self.supervisors[name].run, True)
         added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
         report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
         self._event("reloaded", **asdict(report))
         return report
 
     @staticmethod
-    async def _end(keeper: Keeper) -> None:
-        keeper.scope.cancel()
-        await keeper.close()
+    async def _end(supervisor: BusSupervisor) -> None:
+        supervisor.scope.cancel()
+        await supervisor.close()
 
     async def leave(self) -> None:
         """Exit policies, on all buses at once. `left` tells what became of each servo."""
         reloading = () if self._reloading is None else (self._reloading,)
         await asyncio.gather(*self._stopping, *reloading, return_exceptions=True)
-        self.left.update(await self._leave(self.keepers.values()))
+        self.left.update(await self._leave(self.supervisors.values()))
 
     @staticmethod
-    async def _leave(keepers: Iterable[Keeper]) -> dict[str, StopReport]:
-        reports = await asyncio.gather(*(keeper.leave() for keeper in keepers))
+    async def _leave(supervisors: Iterable[BusSupervisor]) -> dict[str, StopReport]:
+        reports = await asyncio.gather(*(supervisor.leave() for supervisor in supervisors))
         return {name: report for part in reports for name, report in part.items()}
 
     async def close(self) -> None:
         """Every line, once nobody opens them again."""
-        await asyncio.gather(*(keeper.close() for keeper in self.keepers.values()))
+        await asyncio.gather(*(supervisor.close() for supervisor in self.supervisors.values()))
 
     # Motion
 
@@ -163,10 +168,12 @@ class LocalRig(Rig):
 
     async def _stop_all(self) -> dict[str, StopReport]:
         self._event("estop")
-        parking = [(keeper, record) for keeper in self.keepers.values() for record in keeper.enabled("on_estop", "park")]
+        parking = [
+            (supervisor, record) for supervisor in self.supervisors.values() for record in supervisor.enabled("on_estop", "park")
+        ]
         reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
-        for keeper, record in parking:
-            self._track(keeper.park(record))
+        for supervisor, record in parking:
+            self._track(supervisor.park(record))
         return {
             f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
         }
@@ -201,14 +208,14 @@ class LocalRig(Rig):
         for name in names:
             bus, servo = self._names[name]
             parts.setdefault(bus, set()).add(servo)
-        done = await asyncio.gather(*(self._track(self._abandon(self.keepers[bus], part)) for bus, part in parts.items()))
+        done = await asyncio.gather(*(self._track(self._abandon(self.supervisors[bus], part)) for bus, part in parts.items()))
         return {f"{bus}/{servo}": report for bus, part in zip(parts, done, strict=True) for servo, report in part.items()}
 
     @staticmethod
-    async def _abandon(keeper: Keeper, servos: Collection[str]) -> dict[str, StopReport]:
-        parking = [record for record in keeper.enabled("on_lost_client", "park") if record.name in servos]
-        reports = await keeper.bus.motion.abandon(servos)
-        parked = await asyncio.gather(*map(keeper.park, parking))
+    async def _abandon(supervisor: BusSupervisor, servos: Collection[str]) -> dict[str, StopReport]:
+        parking = [record for record in supervisor.enabled("on_lost_client", "park") if record.name in servos]
+        reports = await supervisor.bus.motion.abandon(servos)
+        parked = await asyncio.gather(*map(supervisor.park, parking))
         return reports | {record.name: report for record, report in zip(parking, parked, strict=True)}
 
     # Reading

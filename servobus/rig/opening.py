@@ -25,15 +25,15 @@ async def open_rig(
     path = None if isinstance(config, Config) else Path(config)
     setup = config if isinstance(config, Config) else load_config(config)
     failure: BaseException | None = None
-    async with anyio.create_task_group() as keepers:
-        rig = LocalRig(setup, keepers, buses, trace, path)
+    async with anyio.create_task_group() as supervisors:
+        rig = LocalRig(setup, supervisors, buses, trace, path)
         try:
             await rig.start(degraded=degraded)
             yield rig
         except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
             failure = error
         cancelled = await uncancelled(rig.leave())
-        keepers.cancel_scope.cancel()
+        supervisors.cancel_scope.cancel()
     cancelled = await uncancelled(rig.close()) or cancelled
     if failure or cancelled:
         raise failure or cancelled  # type: ignore[misc]

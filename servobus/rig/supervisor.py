@@ -1,4 +1,4 @@
-"""Keeper: one bus of a rig, with the line it stands on.
+"""BusSupervisor: one bus of a rig, with the line it stands on.
 
 It opens the port, introduces the servos, waits for the line to go down and opens it again, and none of it touches another bus.
 Nothing is written at start; at the end every servo that was enabled here is left as its `on_exit` says.
@@ -32,7 +32,7 @@ EXIT_TIMEOUT = 1.0
 """Seconds the exit policies may take, parking apart."""
 
 
-class Keeper:
+class BusSupervisor:
     """`event(name, **fields)` is told what a person or a log should know."""
 
     def __init__(

@@ -21,7 +21,7 @@ MAX_DEPTH = 32
 MAX_BATCH = 100
 MAX_SUBSCRIPTIONS = 16
 """Of one connection."""
-LEAST_HZ, MOST_HZ = 0.1, 200.0
+MIN_HZ, MAX_HZ = 0.1, 200.0
 
 
 class Params(msgspec.Struct, forbid_unknown_fields=True):
@@ -70,7 +70,7 @@ class Move(Params):
     confirm: bool = False
     speed: Any = None
     duration: Any = None
-    deadline: Any = None
+    start_within: Any = None
 
 
 class MoveTo(Params):
@@ -80,7 +80,7 @@ class MoveTo(Params):
     duration: Any = None
     acceleration: Any = None
     effort: Any = None
-    deadline: Any = None
+    start_within: Any = None
     confirm: bool = False
 
 

@@ -14,7 +14,7 @@ from servobus.protocols.modbus.codec import ModbusCodec
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 from servobus.protocols.realman.codec import Lines, Message, encode
-from servobus.protocols.realman.simulated.arm import SimArm
+from servobus.protocols.realman.simulated.arm import SimulatedArm
 from servobus.protocols.registry import PROTOCOLS
 from servobus.timers import clock_of
 
@@ -56,7 +56,7 @@ class ArmServer:
     def __init__(self, devices: list[Device], generation: int = 3, faults: ArmFaults | None = None) -> None:
         self.devices = devices
         self.faults = faults or ArmFaults()
-        self.arm = SimArm(self._exchange, generation)
+        self.arm = SimulatedArm(self._exchange, generation)
         self.port = 0
         self._rng = Random(self.faults.seed)
         self._delay = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from servobus.bus.bandwidth import TURNAROUND, wire_load
+from servobus.bus.bandwidth import TURNAROUND, line_bandwidth
 from servobus.protocols.base import LineTraits
 from servobus.protocols.registry import PROTOCOLS
 from tests.simulated_rigs import config
@@ -15,7 +15,7 @@ BYTE = 10 / 115200
 def load_of(*servos: str, latency: float = 0.0, **keys: str):  # type: ignore[no-untyped-def]
     options_of = config(*servos, **{"baudrate": "115200", **keys})
     options, models = options_of.buses["arm"], options_of.models["arm"]
-    return wire_load(options, PROTOCOLS["sms"].driver(options, models), LineTraits(options.baudrate, latency=latency))
+    return line_bandwidth(options, PROTOCOLS["sms"].driver(options, models), LineTraits(options.baudrate, latency=latency))
 
 
 def test_goals_of_several_servos_are_one_sync_write() -> None:
@@ -51,5 +51,5 @@ def test_latencies() -> None:
 
 def test_a_line_without_servos_asks_nothing() -> None:
     options = config().buses["arm"].model_copy(update={"servos": {}})
-    load = wire_load(options, PROTOCOLS["sms"].driver(options, {}), LineTraits(options.baudrate))
+    load = line_bandwidth(options, PROTOCOLS["sms"].driver(options, {}), LineTraits(options.baudrate))
     assert (load.total, load.goal_latency, load.estop_latency) == (0, 0, 0)

@@ -45,21 +45,21 @@ def test_what_is_no_finite_number_is_refused_and_never_clamped(value: object, on
 
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=_kind)
-@pytest.mark.parametrize("field", ["speed", "duration", "acceleration", "effort", "deadline"])
+@pytest.mark.parametrize("field", ["speed", "duration", "acceleration", "effort", "start_within"])
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_every_other_field_is_a_finite_number_or_absent(field: str, value: Any, kind: Any) -> None:
     with pytest.raises(LimitError, match=f"{field}: .{{1,50}} is not a finite number"):
         check(replace(Goal(kind, 1.0), **{field: value}))
 
 
-@pytest.mark.parametrize("field", ["speed", "duration", "acceleration", "effort", "deadline"])
+@pytest.mark.parametrize("field", ["speed", "duration", "acceleration", "effort", "start_within"])
 def test_every_other_field_is_above_zero(field: str) -> None:
     with pytest.raises(LimitError, match=f"{field}: -1 must be"):
         check(at(1.0, **{field: -1}))
     assert check(at(1.0, **{field: 1e-9}))
 
 
-@pytest.mark.parametrize("field", ["duration", "acceleration", "effort", "deadline"])
+@pytest.mark.parametrize("field", ["duration", "acceleration", "effort", "start_within"])
 def test_zero_is_refused_where_it_means_nothing(field: str) -> None:
     with pytest.raises(LimitError, match=f"{field}: 0 must be above 0"):
         check(at(1.0, **{field: 0}))
@@ -81,7 +81,7 @@ def test_effort_reaches_to_a_hundred_percent() -> None:
 
 
 def test_without_limits_a_goal_stays_as_it_is() -> None:
-    goal = at(1e6, speed=5.0, acceleration=3.0, effort=10, deadline=1.0)
+    goal = at(1e6, speed=5.0, acceleration=3.0, effort=10, start_within=1.0)
     assert check_goal("elbow", goal, PLAIN, None) == goal
     wheel = Goal("velocity", -1e6)
     assert check_goal("elbow", wheel, PLAIN, None) == wheel

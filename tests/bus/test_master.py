@@ -236,7 +236,7 @@ async def test_what_arrived_and_was_not_read_yet_is_not_late() -> None:
             def __getattr__(self, name: str) -> object:
                 return getattr(transport, name)
 
-            def look(self) -> bool:
+            def poll_input(self) -> bool:
                 looked.append(bus.clock())
                 puppet.say(reply(1, 42))
                 return True

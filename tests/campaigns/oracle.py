@@ -112,7 +112,7 @@ class SmsOracle(Oracle):
             if address == self.ID_ADDRESS:
                 data = bytes((packet.id, *bytes(size - 1)))
             elif size < 2:
-                data = bytes(size)  # too short for a number: asked only at the introduction
+                data = bytes(size)  # too short for a number: asked only at the discovery
             else:
                 data = self._data(self._ask(packet.id, address + size), size)
         return sms_encode(packet.id, 0, data)

@@ -25,7 +25,7 @@ def options(tmp_path: Path) -> Options:
 
 def silence(rig: Rig) -> None:
     """From here on nobody answers."""
-    cast("SimLink", cast("LocalRig", rig).keepers["arm"].link).line.close()
+    cast("SimLink", cast("LocalRig", rig).supervisors["arm"].link).line.close()
 
 
 async def test_how_servos_were_left_is_told_when_nobody_confirms_it(options: Options) -> None:

@@ -1,4 +1,4 @@
-"""Configs with one mistake each: name, what is changed into what, and where the complaint has to point."""
+"""Configs with one mistake each: name, what is changed into what, and where the problem has to point."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ buses:
 
 @dataclass(frozen=True)
 class Mistake:
-    """`line` and `column` from 1; `told` must stand in the complaint."""
+    """`line` and `column` from 1; `told` must stand in the problem."""
 
     before: str
     after: str

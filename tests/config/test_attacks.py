@@ -1,4 +1,4 @@
-"""Configs that mean harm, and configs that are nothing at all: refused in few words, and with nothing but a complaint."""
+"""Configs that mean harm, and configs that are nothing at all: refused in few words, and with nothing but a problem."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servobus.protocols.sms.options import SmsBus, SmsServo
 from tests.config.mistakes import GOOD
 
 
-def complaint(text: str | bytes) -> str:
+def problem(text: str | bytes) -> str:
     with pytest.raises(ConfigError) as caught:
         parse_config(text, "rig.yaml")
     return str(caught.value)
@@ -48,7 +48,7 @@ ATTACKS = {
 
 @pytest.mark.parametrize("text", ATTACKS.values(), ids=ATTACKS)
 def test_an_attack_is_refused_in_few_words(text: str | bytes) -> None:
-    told = complaint(text)
+    told = problem(text)
     assert re.match(r"rig\.yaml:\d+:\d+: ", told)
     assert len(told) < 2048
     assert "x" * 100 not in told
@@ -79,7 +79,7 @@ LONG = "y" * 3000
     ],
 )
 def test_nothing_long_is_repeated(before: str, after: str) -> None:
-    told = complaint(GOOD.replace(before, after))
+    told = problem(GOOD.replace(before, after))
     assert len(told) < 500
     assert LONG[:70] not in told
 

@@ -16,7 +16,7 @@ from tests.config.mistakes import GOOD, MISTAKES, Mistake
 EXAMPLES = Path(__file__).parents[2] / "config"
 
 
-def complaint(text: str | bytes) -> str:
+def problem(text: str | bytes) -> str:
     with pytest.raises(ConfigError) as caught:
         parse_config(text, "rig.yaml")
     return str(caught.value)
@@ -43,22 +43,22 @@ def test_a_config_cannot_be_changed() -> None:
 
 @pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_told_at_its_place(mistake: Mistake) -> None:
-    told = complaint(mistake.text)
+    told = problem(mistake.text)
     assert told.startswith(f"rig.yaml:{mistake.line}:{mistake.column}: "), told
     assert mistake.told in told
-    assert len(told.splitlines()) == 1, "one mistake, one complaint"
+    assert len(told.splitlines()) == 1, "one mistake, one problem"
 
 
 def test_all_mistakes_are_told_in_the_order_of_the_file() -> None:
     text = GOOD.replace("id: 2", "id: 254").replace("feedback: 50", "feedback: -1").replace("1000000", "fast")
-    lines = complaint(text).splitlines()
+    lines = problem(text).splitlines()
     assert [int(line.split(":")[1]) for line in lines] == [6, 7, 10]
 
 
 def test_one_mistake_hides_no_other() -> None:
     text = GOOD.replace("poll: {feedback: 50}", "poll: {feedbck: 50}").replace("id: 2,", "id: 1, limits: [0, 99999],")
     text += "      wrist: {id: 3, modle: sts}\n"
-    lines = complaint(text).splitlines()
+    lines = problem(text).splitlines()
     assert [line.split(": ")[1].removeprefix("buses.arm.") for line in lines] == [
         "poll.feedbck",
         "servos.elbow.id",
@@ -69,14 +69,14 @@ def test_one_mistake_hides_no_other() -> None:
 
 def test_a_mistake_of_a_bus_hides_no_mistake_of_the_next() -> None:
     text = two_buses("/dev/ttyS77", "/dev/ttyS77").replace("    baudrate", "    baud: 1\n    baudrate", 1)
-    told = complaint(text)
+    told = problem(text)
     assert "rig.yaml:6:5: buses.left.baud: unknown key" in told
     assert "rig.yaml:10:11: buses.right.port: found the port of bus left again" in told
 
 
 def test_a_file_with_very_many_mistakes_is_not_told_in_full() -> None:
     text = "version: 1\nbuses:\n" + "".join(f"  b{number}: 7\n" for number in range(100))
-    lines = complaint(text).splitlines()
+    lines = problem(text).splitlines()
     assert len(lines) == MOST + 1
     assert lines[-1] == f"and {100 - MOST} more; correct these first"
 
@@ -99,14 +99,14 @@ def test_a_file_with_very_many_mistakes_is_not_told_in_full() -> None:
     ],
 )
 def test_what_is_no_config(text: str, told: str) -> None:
-    assert told in complaint(text)
+    assert told in problem(text)
 
 
 def test_servos_that_are_no_servos() -> None:
-    assert "found no keys here; there are id, model" in complaint(GOOD.replace("{id: 2, model: sts}", "7"))
-    assert "servos: found no keys here" in complaint(re.sub(r"servos:(.|\n)*", "servos: 7\n", GOOD))
-    assert "found 1 of its values; write 2 or more" in complaint(GOOD.replace("[-90, 90]", "[-90]"))
-    assert "letters, digits, . _ -" in complaint(GOOD.replace("elbow:", "'el bow':"))
+    assert "found no keys here; there are id, model" in problem(GOOD.replace("{id: 2, model: sts}", "7"))
+    assert "servos: found no keys here" in problem(re.sub(r"servos:(.|\n)*", "servos: 7\n", GOOD))
+    assert "found 1 of its values; write 2 or more" in problem(GOOD.replace("[-90, 90]", "[-90]"))
+    assert "letters, digits, . _ -" in problem(GOOD.replace("elbow:", "'el bow':"))
 
 
 # What only the whole file shows
@@ -118,14 +118,14 @@ def two_buses(first: str, second: str) -> str:
 
 
 def test_two_buses_on_one_port() -> None:
-    told = complaint(two_buses("/dev/ttyS77", "/dev/ttyS77"))
+    told = problem(two_buses("/dev/ttyS77", "/dev/ttyS77"))
     assert told.startswith("rig.yaml:9:11: buses.right.port: found the port of bus left again")
 
 
 def test_two_buses_on_one_port_by_two_names(tmp_path: Path) -> None:
     (tmp_path / "device").touch()
     (tmp_path / "link").symlink_to(tmp_path / "device")
-    assert "port of bus left again" in complaint(two_buses(str(tmp_path / "device"), str(tmp_path / "link")))
+    assert "port of bus left again" in problem(two_buses(str(tmp_path / "device"), str(tmp_path / "link")))
 
 
 def test_two_simulated_buses_are_two_lines() -> None:
@@ -137,12 +137,12 @@ def test_two_simulated_buses_are_two_lines() -> None:
 )
 def test_what_the_model_cannot_do_at_its_edge(key: str, greatest: str, beyond: str) -> None:
     parse_config(GOOD.replace("id: 2,", f"id: 2, {key}: {greatest},"), "rig.yaml")
-    assert f"elbow.{key}" in complaint(GOOD.replace("id: 2,", f"id: 2, {key}: {beyond},"))
+    assert f"elbow.{key}" in problem(GOOD.replace("id: 2,", f"id: 2, {key}: {beyond},"))
 
 
 def test_a_model_that_has_no_acceleration_says_so() -> None:
     text = GOOD.replace("id: 2, model: sts", "id: 2, model: scs, acceleration: 100")
-    assert "model scs has none" in complaint(text)
+    assert "model scs has none" in problem(text)
 
 
 def test_a_model_file_beside_the_config(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_mistakes_in_a_model_file_are_told_once(tmp_path: Path) -> None:
 
 def test_a_model_that_is_refused_hides_no_other_mistake() -> None:
     text = GOOD.replace("id: 1, model: sts", "id: 1, model: stx").replace("id: 2,", "id: 2, unit: feet,")
-    assert [line.split(":")[1] for line in complaint(text).splitlines()] == ["9", "10"]
+    assert [line.split(":")[1] for line in problem(text).splitlines()] == ["9", "10"]
 
 
 def test_lines_are_counted_when_many_models_are_wrong(tmp_path: Path) -> None:

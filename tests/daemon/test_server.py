@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from servobus.daemon.connection import MOST_TASKS
+from servobus.daemon.connection import MAX_TASKS
 from servobus.rpc.methods import MAX_BATCH, MAX_LINE
 from tests.daemon.raw_client import dialled, served
 from tests.simulated_rigs import config
@@ -117,7 +117,7 @@ async def test_stops_and_renewals_wait_for_no_call_under_way(tmp_path: Path) -> 
     async with served(tmp_path, config(*SLOW), rate=50) as (rig, _, path), dialled(path) as raw:
         await raw.call("enable")
         assert await raw.call("move_to", name="s1", position=60) == "acked"
-        for _ in range(MOST_TASKS + 10):
+        for _ in range(MAX_TASKS + 10):
             raw.ask("settle", names=["s1"], timeout=100, tolerance=0.001)
         late = raw.ask("names")
         for _ in range(8):

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from servobus.daemon.connection import MOST_WAITING
+from servobus.daemon.connection import MAX_WAITING
 from servobus.rpc.methods import MAX_SUBSCRIPTIONS
 from tests.daemon.raw_client import dialled, served
 from tests.simulated_rigs import config, devices
@@ -91,7 +91,7 @@ async def test_there_is_an_end_to_what_may_wait_and_nothing_of_it_is_lost(tmp_pa
         for number in numbers:
             assert (await raw.line())["id"] == number
             most = max(most, next(iter(door.connections))._waiting)
-        assert MOST_WAITING / 2 < most < 3 * MOST_WAITING, "one more piece of the socket may be read before it rests"
+        assert MAX_WAITING / 2 < most < 3 * MAX_WAITING, "one more piece of the socket may be read before it rests"
         assert not next(iter(door.connections))._waiting
 
 

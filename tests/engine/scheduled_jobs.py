@@ -73,7 +73,7 @@ class Flood:
             self.bench.coalescer.put(ticket(1, self._ended, expires=self.now + 1))
         if "request" in self.classes and len(self.bench.scheduler.requests) < 4:
             self.bench.scheduler.submit(job(2, expires=self.now + 1), self.now)
-        return self.bench.scheduler.next_turn(self.now)
+        return self.bench.scheduler.next_job(self.now)
 
     def kinds(self, count: int) -> list[str]:
         return [kind(self.turn()) for _ in range(count)]
@@ -84,7 +84,7 @@ def split_bench(ended: Ended, **traits: Any) -> tuple[Bench, Job]:
     bench = Bench(1, 2, 3, most=1)
     for number in (1, 2, 3):
         bench.coalescer.put(ticket(number, ended, **traits))
-    first = bench.scheduler.next_turn(0.0)
+    first = bench.scheduler.next_job(0.0)
     assert first is not None
     assert bench.scheduler.split_groups == 1
     assert bench.scheduler.waiting() == 2

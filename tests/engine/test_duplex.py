@@ -27,7 +27,7 @@ def config(duplex: str, *, delays: str = "[0, 0.5]", **keys: str):  # type: igno
 
 
 def link_of(rig: LocalRig) -> SimLink:
-    link = rig.keepers["line"].link
+    link = rig.supervisors["line"].link
     assert isinstance(link, SimLink)
     return link
 

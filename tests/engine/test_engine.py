@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from servobus.engine.health import FIRST_DEADLINE, GREATEST_DEADLINE
+from servobus.engine.health import FIRST_DEADLINE, MAX_DEADLINE
 from servobus.engine.queue import TRIES
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.protocols.base import Plan, Request
@@ -210,7 +210,7 @@ def test_a_group_read_believes_who_answered_and_doubts_who_did_not() -> None:
     rig = Rig()
     before = rig.node(1).deadline
     told = rig.submit(group_read(1, 2, 3))
-    rig.hear(reply(1, READ, 10).frame, reply(3, READ, 30).frame, latency=GREATEST_DEADLINE)
+    rig.hear(reply(1, READ, 10).frame, reply(3, READ, 30).frame, latency=MAX_DEADLINE)
     assert told == [{1: 10, 3: 30}]
     assert [rig.node(number).condition for number in (1, 2, 3)] == ["online", "doubtful", "online"]
     assert rig.node(1).deadline == before == FIRST_DEADLINE, "those who answered do not pay for the one who did not"

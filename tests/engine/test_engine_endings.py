@@ -35,7 +35,7 @@ def test_a_servo_that_has_restarted_can_still_be_asked() -> None:
 def test_a_goal_under_way_is_not_repeated_to_a_servo_that_has_restarted() -> None:
     rig = Rig()
     ended: list[tuple[str, Any]] = []
-    rig.driver.plan = lambda goals, **_: [_confirmed_turn(rig)]  # type: ignore[method-assign]
+    rig.driver.plan_goals = lambda goals, **_: [_confirmed_turn(rig)]  # type: ignore[method-assign]
     rig.coalescer.put(ticket(1, ended, expires=9.0))
     assert rig.miss() == ask(50)
     rig.driver.restarted.add(1)

@@ -7,10 +7,10 @@ import pytest
 from servobus.engine.health import (
     FIRST_BACKOFF,
     FIRST_DEADLINE,
-    GREATEST_BACKOFF,
-    GREATEST_DEADLINE,
-    LEAST_DEADLINE,
-    MOST_OUTSTANDING,
+    MAX_BACKOFF,
+    MAX_DEADLINE,
+    MAX_OUTSTANDING,
+    MIN_DEADLINE,
     OFFLINE_AFTER,
     Condition,
     Health,
@@ -23,7 +23,7 @@ ONLINE, DOUBTFUL, OFFLINE = Condition.ONLINE, Condition.DOUBTFUL, Condition.OFFL
 class Watched:
     """The health of nodes 1 and 2, and all changes that were told."""
 
-    def __init__(self, *, online: bool = True, greatest: float = GREATEST_DEADLINE) -> None:
+    def __init__(self, *, online: bool = True, greatest: float = MAX_DEADLINE) -> None:
         self.changes: list[tuple[int, Condition, Condition]] = []
         self.health = Health((1, 2), greatest_deadline=greatest, changed=self._changed)
         if online:
@@ -55,13 +55,13 @@ def test_the_deadline_is_learned_and_stays_within_its_bounds() -> None:
     node = Watched().node
     for _ in range(100):
         node.learn(0.0001)
-    assert node.deadline == LEAST_DEADLINE
+    assert node.deadline == MIN_DEADLINE
     for _ in range(100):
         node.learn(0.02)
     assert 0.02 <= node.deadline < 0.021
     for _ in range(100):
         node.learn(5.0)
-    assert node.deadline == GREATEST_DEADLINE
+    assert node.deadline == MAX_DEADLINE
 
 
 def test_the_first_answer_sets_mean_and_spread_and_a_jittery_node_is_given_more() -> None:
@@ -77,7 +77,7 @@ def test_the_first_answer_sets_mean_and_spread_and_a_jittery_node_is_given_more(
 def test_an_answer_that_came_before_it_could_counts_as_immediate() -> None:
     node = Watched().node
     node.learn(-3.0)
-    assert node.deadline == LEAST_DEADLINE
+    assert node.deadline == MIN_DEADLINE
 
 
 def test_the_greatest_deadline_of_a_config_holds_even_below_the_least() -> None:
@@ -175,11 +175,11 @@ def test_replies_that_may_still_come_are_kept_oldest_first_and_forgotten_by_a_fe
 
 def test_no_more_than_so_many_are_kept() -> None:
     node = Watched().node
-    for key in range(MOST_OUTSTANDING):
+    for key in range(MAX_OUTSTANDING):
         node.doubt(key, 0.0)
-    assert list(node.outstanding) == list(range(MOST_OUTSTANDING))
+    assert list(node.outstanding) == list(range(MAX_OUTSTANDING))
     node.doubt("one more", 0.0)
-    assert list(node.outstanding) == [*range(1, MOST_OUTSTANDING), "one more"]
+    assert list(node.outstanding) == [*range(1, MAX_OUTSTANDING), "one more"]
 
 
 # Probes
@@ -193,9 +193,9 @@ def test_a_doubtful_node_is_probed_at_once_and_an_offline_one_ever_more_seldom()
         watched.miss(now=now)
         pauses.append(watched.node.next_probe - now)
         now = watched.node.next_probe
-    expected = [min(FIRST_BACKOFF * 2**step, GREATEST_BACKOFF) for step in range(9)]
+    expected = [min(FIRST_BACKOFF * 2**step, MAX_BACKOFF) for step in range(9)]
     assert pauses == pytest.approx(expected)
-    assert pauses[-2:] == pytest.approx([GREATEST_BACKOFF, GREATEST_BACKOFF])
+    assert pauses[-2:] == pytest.approx([MAX_BACKOFF, MAX_BACKOFF])
 
 
 def test_after_it_came_back_the_backoff_starts_anew() -> None:

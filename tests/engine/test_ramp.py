@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from servobus.engine.coalescer import Ticket
-from servobus.engine.ramp import Profile
+from servobus.engine.ramp import SetpointRamps
 from servobus.errors import ReplyTimeout
 from servobus.values import Goal, Outcome, ServoGoal
 
@@ -18,7 +18,7 @@ HZ = 10.0
 class Bench:
     def __init__(self) -> None:
         self.cuts: list[tuple[str, Exception]] = []
-        self.profile = Profile(HZ, lambda servo, error: self.cuts.append((servo, error)))
+        self.profile = SetpointRamps(HZ, lambda servo, error: self.cuts.append((servo, error)))
         self.results: list[Any] = []
 
     def ticket(self, target: float, start: float | None = 0.0, *, now: float = 0.0) -> Ticket:

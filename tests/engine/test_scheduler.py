@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from servobus.engine.health import GREATEST_BACKOFF
+from servobus.engine.health import MAX_BACKOFF
 from servobus.engine.polls import PollTimer
 from servobus.engine.queue import Job
 from servobus.engine.scheduler import POLL_PATIENCE, PROBE_PAUSE
@@ -26,7 +26,7 @@ def test_the_classes_go_in_their_order() -> None:
     bench.scheduler.submit(job(2), 0.0)
     bench.coalescer.put(ticket(1, ended))
     bench.scheduler.estop.append(stop_job())
-    assert [kind(bench.scheduler.next_turn(0.0)) for _ in range(5)] == ["estop", "goal", "request", "poll", "probe"]
+    assert [kind(bench.scheduler.next_job(0.0)) for _ in range(5)] == ["estop", "goal", "request", "poll", "probe"]
 
 
 @pytest.mark.parametrize(
@@ -98,10 +98,10 @@ def test_polls_of_one_rate_are_spread_over_their_period() -> None:
     bench = Bench(1, 2)
     bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
     assert bench.scheduler.wake() == 5.0
-    assert kind(bench.scheduler.next_turn(5.0)) == "poll"
-    assert bench.scheduler.next_turn(5.049) is None
+    assert kind(bench.scheduler.next_job(5.0)) == "poll"
+    assert bench.scheduler.next_job(5.049) is None
     assert bench.scheduler.wake() == pytest.approx(5.05)
-    second = bench.scheduler.next_turn(5.051)
+    second = bench.scheduler.next_job(5.051)
     assert second is not None
     assert second.request is not None
     assert second.request.nodes == (2,)
@@ -113,7 +113,7 @@ def test_polls_of_one_rate_are_spread_over_their_period() -> None:
 def test_missed_polls_are_counted_and_the_count_survives_new_polls() -> None:
     bench = Bench(1)
     bench.scheduler.polls.set([poll("a", 10, 1)], 0.0)
-    assert kind(bench.scheduler.next_turn(0.55)) == "poll"
+    assert kind(bench.scheduler.next_job(0.55)) == "poll"
     assert bench.scheduler.polls.missed == 5
     bench.scheduler.polls.set([poll("a", 10, 1)], 1.0)
     assert bench.scheduler.polls.missed == 5
@@ -125,7 +125,7 @@ def test_a_poll_of_nobody_who_can_be_reached_costs_no_turn() -> None:
     bench = Bench(1, 2)
     bench.take_offline(1)
     bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
-    taken = bench.scheduler.next_turn(0.05)
+    taken = bench.scheduler.next_job(0.05)
     assert taken is not None
     assert taken.request is not None
     assert taken.request.nodes == (2,)
@@ -136,41 +136,41 @@ def test_a_poll_of_nobody_who_can_be_reached_costs_no_turn() -> None:
 
 def test_a_doubtful_node_is_probed_and_believed_again() -> None:
     bench = Bench(1, online=False)
-    taken = bench.scheduler.next_turn(0.0)
+    taken = bench.scheduler.next_job(0.0)
     assert taken is not None
     assert (taken.recovery, taken.node) == (True, 1)
     assert taken.plan is not None
     assert run_plan(taken.plan, lambda _: None) is True
     taken.succeed(True)
     assert bench.node(1).condition == "online"
-    assert (bench.restarts, bench.scheduler.next_turn(0.0)) == ([], None)
+    assert (bench.restarts, bench.scheduler.next_job(0.0)) == ([], None)
 
 
 def test_a_probe_finds_that_a_servo_has_restarted() -> None:
     bench = Bench(1, online=False)
     bench.driver.restarted.add(1)
-    finish(bench.scheduler.next_turn(0.0))
+    finish(bench.scheduler.next_job(0.0))
     assert bench.restarts == [1]
 
 
 def test_a_probe_that_is_refused_is_not_repeated_at_once() -> None:
     bench = Bench(1, online=False)
-    taken = bench.scheduler.next_turn(5.0)
+    taken = bench.scheduler.next_job(5.0)
     assert taken is not None
     taken.fail(DeviceError("not now"))
     assert bench.node(1).next_probe == 5.0 + PROBE_PAUSE
-    assert bench.scheduler.next_turn(5.0) is None
-    assert kind(bench.scheduler.next_turn(5.0 + PROBE_PAUSE)) == "probe"
+    assert bench.scheduler.next_job(5.0) is None
+    assert kind(bench.scheduler.next_job(5.0 + PROBE_PAUSE)) == "probe"
 
 
 def test_it_is_woken_for_the_next_probe() -> None:
     bench = Bench(1)
     bench.take_offline(1, now=2.0)
     due = bench.node(1).next_probe
-    assert 2.0 < due < 2.0 + GREATEST_BACKOFF
-    assert bench.scheduler.next_turn(2.0) is None
+    assert 2.0 < due < 2.0 + MAX_BACKOFF
+    assert bench.scheduler.next_job(2.0) is None
     assert bench.scheduler.wake() == due
-    assert kind(bench.scheduler.next_turn(due)) == "probe"
+    assert kind(bench.scheduler.next_job(due)) == "probe"
 
 
 # Sessions and the e-stop
@@ -206,8 +206,8 @@ def test_an_estop_drops_what_moves_wherever_it_waits() -> None:
     assert {type(result) for _, result in ended} == {EStopped}
     assert [type(each) for job_ in (moving, parked_moving) for each in results(job_)] == [EStopped, EStopped]
     bench.health.recovered(bench.node(3))
-    assert {bench.scheduler.next_turn(0.0), bench.scheduler.next_turn(0.0)} == {reading, parked_reading}
-    assert bench.scheduler.next_turn(0.0) is None
+    assert {bench.scheduler.next_job(0.0), bench.scheduler.next_job(0.0)} == {reading, parked_reading}
+    assert bench.scheduler.next_job(0.0) is None
 
 
 def test_a_lost_line_ends_everything() -> None:
@@ -221,7 +221,7 @@ def test_a_lost_line_ends_everything() -> None:
     bench.scheduler.drop(estopped, motion_only=False)
     assert [len(results(each)) for each in (*jobs, stop)] == [1, 1, 1, 1]
     assert len(ended) == 2, "the first frame was taken before"
-    assert (bench.scheduler.waiting(), bench.scheduler.next_turn(0.0)) == (0, None)
+    assert (bench.scheduler.waiting(), bench.scheduler.next_job(0.0)) == (0, None)
 
 
 # Everything at once
@@ -248,7 +248,7 @@ def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) ->
         bench.coalescer.put(ticket(number, ended, expires=now + rng.uniform(0.001, 0.05), batch=rng.choice((None, None, 1, 2))))
 
     def turn() -> None:
-        taken = bench.scheduler.next_turn(now)
+        taken = bench.scheduler.next_job(now)
         if taken is None:
             bench.scheduler.expire(now)
         elif rng.random() < 0.1:

@@ -17,7 +17,7 @@ def test_goals_of_one_tick_are_one_turn_and_each_is_told_its_outcome() -> None:
     bench, ended = Bench(), Ended()
     for number in (1, 2, 3):
         bench.coalescer.put(ticket(number, ended))
-    finish(bench.scheduler.next_turn(0.0))
+    finish(bench.scheduler.next_job(0.0))
     assert ended == [("s1", Outcome.SENT), ("s2", Outcome.SENT), ("s3", Outcome.SENT)]
     assert bench.scheduler.split_groups == 0
 
@@ -26,7 +26,7 @@ def test_one_error_ends_all_goals_of_its_turn() -> None:
     bench, ended = Bench(), Ended()
     bench.coalescer.put(ticket(1, ended))
     bench.coalescer.put(ticket(2, ended))
-    taken = bench.scheduler.next_turn(0.0)
+    taken = bench.scheduler.next_job(0.0)
     assert taken is not None
     error = ReplyTimeout("gone")
     taken.fail(error)
@@ -39,11 +39,11 @@ def test_goals_the_driver_refuses_end_with_its_error_and_the_next_go_on(refusal:
     bench.driver.refusal = refusal
     bench.coalescer.put(ticket(1, ended))
     bench.coalescer.put(ticket(2, ended, confirm=True))
-    assert bench.scheduler.next_turn(0.0) is None
+    assert bench.scheduler.next_job(0.0) is None
     assert ended == [("s1", refusal), ("s2", refusal)]
     bench.driver.refusal = None
     bench.coalescer.put(ticket(1, ended))
-    assert kind(bench.scheduler.next_turn(0.0)) == "goal"
+    assert kind(bench.scheduler.next_job(0.0)) == "goal"
 
 
 def test_the_frames_of_a_split_group_leave_one_after_the_other_with_a_lower_turn_between() -> None:
@@ -51,9 +51,9 @@ def test_the_frames_of_a_split_group_leave_one_after_the_other_with_a_lower_turn
     bench, first = split_bench(ended)
     bench.scheduler.submit(job(1), 0.0)
     finish(first)
-    assert kind(bench.scheduler.next_turn(0.0)) == "request"
-    finish(bench.scheduler.next_turn(0.0))
-    finish(bench.scheduler.next_turn(0.0))
+    assert kind(bench.scheduler.next_job(0.0)) == "request"
+    finish(bench.scheduler.next_job(0.0))
+    finish(bench.scheduler.next_job(0.0))
     assert [servo for servo, _ in ended] == ["s1", "s2", "s3"]
 
 
@@ -61,7 +61,7 @@ def test_a_frame_that_waited_too_long_is_not_sent() -> None:
     ended: Ended = []
     bench, first = split_bench(ended, expires=1.0)
     finish(first)
-    assert bench.scheduler.next_turn(1.0) is None
+    assert bench.scheduler.next_job(1.0) is None
     assert [(servo, type(result)) for servo, result in ended[1:]] == [("s2", GoalExpired), ("s3", GoalExpired)]
 
 
@@ -70,7 +70,7 @@ def test_a_frame_whose_caller_left_is_not_sent() -> None:
     left: list[bool] = []
     bench, _ = split_bench(ended, gone=lambda: bool(left))
     left.append(True)
-    assert bench.scheduler.next_turn(0.0) is None
+    assert bench.scheduler.next_job(0.0) is None
     assert (ended, bench.scheduler.waiting()) == ([], 0)
 
 
@@ -80,14 +80,14 @@ def test_a_frame_whose_servo_is_in_doubt_waits_and_newer_goals_replace_it() -> N
     finish(first)
     bench.health.missed(bench.node(2), READ | ANSWER, 0.0, 5.0)
     bench.coalescer.put(ticket(3, ended))
-    third = bench.scheduler.next_turn(0.1)
+    third = bench.scheduler.next_job(0.1)
     finish(third)
     assert ended[1:] == [("s3", Outcome.SENT)], "the planned one, which was before the newer"
-    finish(bench.scheduler.next_turn(0.1))
+    finish(bench.scheduler.next_job(0.1))
     assert ended[2:] == [("s3", Outcome.SENT)]
-    assert bench.scheduler.next_turn(0.1) is None
+    assert bench.scheduler.next_job(0.1) is None
     bench.health.recovered(bench.node(2))
-    finish(bench.scheduler.next_turn(0.1))
+    finish(bench.scheduler.next_job(0.1))
     assert ended[3:] == [("s2", Outcome.SENT)]
 
 
@@ -96,9 +96,9 @@ def test_a_disabled_servo_gets_no_goal_that_was_planned_already() -> None:
     bench, _ = split_bench(ended)
     bench.scheduler.drop_goals(disabled, {"s2"})
     assert [(servo, type(result)) for servo, result in ended] == [("s2", NotEnabled)]
-    finish(bench.scheduler.next_turn(0.0))
+    finish(bench.scheduler.next_job(0.0))
     assert ended[1:] == [("s3", Outcome.SENT)]
-    assert bench.scheduler.next_turn(0.0) is None
+    assert bench.scheduler.next_job(0.0) is None
 
 
 def test_a_group_asked_for_together_is_never_sent_without_one_of_it() -> None:
@@ -107,7 +107,7 @@ def test_a_group_asked_for_together_is_never_sent_without_one_of_it() -> None:
         bench.coalescer.put(ticket(number, ended, batch=1))
     bench.scheduler.drop_goals(disabled, {"s1"})
     assert [(servo, type(result)) for servo, result in ended] == [("s1", NotEnabled), ("s2", ActionWithheld)]
-    assert bench.scheduler.next_turn(0.0) is None
+    assert bench.scheduler.next_job(0.0) is None
 
 
 # Requests and nodes
@@ -120,7 +120,7 @@ def test_overload_comes_at_exactly_the_limit() -> None:
     with pytest.raises(Overloaded):
         bench.scheduler.submit(job(2), 0.0)
     assert bench.scheduler.waiting() == 2
-    assert bench.scheduler.next_turn(0.0) is not None
+    assert bench.scheduler.next_job(0.0) is not None
     bench.scheduler.submit(job(2), 0.0)
 
 
@@ -134,7 +134,7 @@ def test_requests_for_an_offline_node_wait_aside_as_long_as_an_answer_would_take
         bench.scheduler.submit(job(1), 0.0)
     bench.scheduler.submit(other := job(2), 0.0)
     assert bench.scheduler.wake() == FIRST_DEADLINE
-    assert bench.scheduler.next_turn(FIRST_DEADLINE - 0.001) is other
+    assert bench.scheduler.next_job(FIRST_DEADLINE - 0.001) is other
     assert [results(each) for each in waiting] == [[], []]
     bench.scheduler.expire(FIRST_DEADLINE)
     for each in waiting:
@@ -153,7 +153,7 @@ def test_a_busy_line_ends_them_in_time_too() -> None:
     bench.scheduler.submit(plan_job, 0.0)
     for _ in range(3):
         bench.scheduler.submit(job(2), 0.0)
-    assert kind(bench.scheduler.next_turn(FIRST_DEADLINE)) == "request"
+    assert kind(bench.scheduler.next_job(FIRST_DEADLINE)) == "request"
     assert len(results(waiting)) == len(results(plan_job)) == 1
 
 
@@ -165,9 +165,9 @@ def test_they_are_served_in_order_when_the_node_comes_back() -> None:
     bench.take_offline(1)
     parked = job(1)
     bench.scheduler.submit(parked, 0.0)
-    assert bench.scheduler.next_turn(0.001) is None
+    assert bench.scheduler.next_job(0.001) is None
     bench.health.recovered(bench.node(1))
-    assert [bench.scheduler.next_turn(0.001) for _ in range(3)] == [*queued, parked]
+    assert [bench.scheduler.next_job(0.001) for _ in range(3)] == [*queued, parked]
 
 
 def test_what_was_queued_when_its_node_went_offline_does_not_wait_longer_than_what_comes_then() -> None:
@@ -185,8 +185,8 @@ def test_urgent_requests_are_said_to_an_offline_node() -> None:
     bench.scheduler.submit(before := job(1, urgent=True), 0.0)
     bench.take_offline(1)
     bench.scheduler.submit(after := job(1, urgent=True), 0.0)
-    assert bench.scheduler.next_turn(0.0) is before
-    assert bench.scheduler.next_turn(0.0) is after
+    assert bench.scheduler.next_job(0.0) is before
+    assert bench.scheduler.next_job(0.0) is after
 
 
 def test_an_offline_nodes_callers_who_left_are_forgotten() -> None:
@@ -205,6 +205,6 @@ def test_a_retried_request_stays_first_of_its_node_and_the_other_nodes_go_before
     first, second, other = job(1), job(1), job(2)
     for each in (first, second, other):
         bench.scheduler.submit(each, 0.0)
-    assert bench.scheduler.next_turn(0.0) is first
+    assert bench.scheduler.next_job(0.0) is first
     bench.scheduler.retry(first)
-    assert [bench.scheduler.next_turn(0.0) for _ in range(3)] == [other, first, second]
+    assert [bench.scheduler.next_job(0.0) for _ in range(3)] == [other, first, second]

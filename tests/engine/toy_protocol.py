@@ -14,7 +14,7 @@ from servobus.engine.coalescer import Coalescer, Ticket
 from servobus.engine.health import Condition, Health, Node
 from servobus.engine.scheduler import QUEUE_LIMIT, Scheduler
 from servobus.errors import DeviceError
-from servobus.protocols.base import Driver, GoalTurn, Plan, Poll, Request
+from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request
 from servobus.values import Goal, Outcome, ServoGoal
 
 READ, PING, WRITE, ANSWER = 1, 2, 3, 0x80
@@ -134,18 +134,18 @@ class ToyDriver:
         self.refusal: Exception | None = None
         """What `plan` raises."""
 
-    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         number = next(number for number in range(256) if (PING | ANSWER, number) not in avoid)
         yield ToyRequest(node, PING, number)
         return node not in self.restarted
 
-    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> list[GoalTurn]:
+    def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> list[GoalPlan]:
         if self.refusal is not None:
             raise self.refusal
         names = [goal.servo for goal in goals]
         most = len(names) if together else self.most
         parts = [tuple(names[at : at + most]) for at in range(0, len(names), most)]
-        return [GoalTurn(part, self._say(part)) for part in parts]
+        return [GoalPlan(part, self._say(part)) for part in parts]
 
     @staticmethod
     def _say(servos: tuple[str, ...]) -> Plan[dict[str, Outcome | Exception]]:

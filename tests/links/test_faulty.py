@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from servobus.links.faulty import LONGEST_PIECE, MOST_NOISE, FaultyEnd
+from servobus.links.faulty import LONGEST_PIECE, MAX_NOISE, FaultyEnd
 from servobus.protocols.options import FaultOptions
 from tests.virtual_time import virtual
 
@@ -126,7 +126,7 @@ async def test_wrong_id() -> None:
 
 @virtual
 async def test_noise() -> None:
-    assert set(await struck("noise")) == {bytes(size) + FRAME for size in range(1, MOST_NOISE + 1)}
+    assert set(await struck("noise")) == {bytes(size) + FRAME for size in range(1, MAX_NOISE + 1)}
 
 
 @virtual

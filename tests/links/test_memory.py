@@ -44,7 +44,7 @@ async def test_both_ways() -> None:
     assert (link.traits, link.address) == (TRAITS, "sim:")
     assert far.heard == [b"question", 115_200]
     assert (ear.made, ear.pieces) == (1, [b"answer"])
-    assert not transport.look()
+    assert not transport.poll_input()
 
 
 @virtual

@@ -12,7 +12,7 @@ import pytest
 from servobus.config.loader import Config, parse_config
 from servobus.errors import ConfigError, DeviceError, LinkDown, ServobusError
 from servobus.links import open_link
-from servobus.protocols.roh import ENTRY
+from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
@@ -36,7 +36,7 @@ def config(port: int, *, keys: str = "", poll: str = "{}") -> Config:
 async def arm(generation: int = 3, faults: ArmFaults | None = None) -> AsyncIterator[tuple[ArmServer, RohDevice]]:
     """An arm and the hand behind it."""
     setup = config(1)
-    (hand,) = ENTRY.devices(setup.buses["hand"], setup.models["hand"])
+    (hand,) = DEFINITION.devices(setup.buses["hand"], setup.models["hand"])
     assert isinstance(hand, RohDevice)
     async with ArmServer([hand], generation, faults) as server:
         yield server, hand

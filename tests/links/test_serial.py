@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from servobus.errors import LinkDown
-from servobus.links.serial import MOST_UNSENT, UART_LATENCY, USB_LATENCY, SerialLink
+from servobus.links.serial import MAX_UNSENT, UART_LATENCY, USB_LATENCY, SerialLink
 from servobus.protocols.base import LineTraits
 from tests.links.bare_pty import plugged
 from tests.links.recorder import Ear, on_each_loop
@@ -82,7 +82,7 @@ async def test_bytes_that_wait_for_a_rate_are_bounded() -> None:
         transport = await SerialLink(pty.path, 300).connect(ear)
         transport.write(bytes(300))
         transport.set_baudrate(115_200)
-        transport.write(bytes(MOST_UNSENT))
+        transport.write(bytes(MAX_UNSENT))
         assert not transport.is_closing()
         transport.write(b"x")
         assert "takes no more bytes" in str(await ear.gone())
@@ -105,16 +105,16 @@ async def test_looking_hands_over_what_is_there() -> None:
     ear = Ear()
     with plugged() as pty:
         transport = await SerialLink(pty.path, 115_200).connect(ear)
-        assert transport.look()
+        assert transport.poll_input()
         pty.say(b"late")
         assert ear.heard == b""
-        assert transport.look()
+        assert transport.poll_input()
         assert ear.heard == b"late"
-        assert transport.look()
+        assert transport.poll_input()
         assert (ear.pieces, ear.lost) == ([b"late"], [])
         transport.abort()
         pty.say(b"too late")
-        assert transport.look()
+        assert transport.poll_input()
         assert await ear.gone() is None
         assert ear.heard == b"late"
 
@@ -143,8 +143,8 @@ async def test_no_rs485_mode() -> None:
 async def test_cancelled_while_it_opens(rs485: bool) -> None:
     """What the thread opens then, or fails to, is nobody's: the port is free again, and nothing is complained about."""
     loop = asyncio.get_running_loop()
-    complaints: list[dict[str, Any]] = []
-    loop.set_exception_handler(lambda loop, context: complaints.append(context))
+    problems: list[dict[str, Any]] = []
+    loop.set_exception_handler(lambda loop, context: problems.append(context))
     loop.set_default_executor(ThreadPoolExecutor(1))
     ear = Ear()
     with plugged() as pty:
@@ -156,7 +156,7 @@ async def test_cancelled_while_it_opens(rs485: bool) -> None:
         await loop.run_in_executor(None, int)  # behind the opening, in the only thread
         fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
     gc.collect()
-    assert (ear.made, complaints) == (0, [])
+    assert (ear.made, problems) == (0, [])
 
 
 async def test_cancelled_as_it_opened() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from servobus.errors import LinkDown
-from servobus.links.serial import MOST_UNSENT, DirectTransport, SerialLink
+from servobus.links.serial import MAX_UNSENT, DirectTransport, SerialLink
 from tests.links.bare_pty import Pty, plugged
 from tests.links.recorder import Ear, on_each_loop
 
@@ -42,7 +42,7 @@ async def test_what_waits_for_room_is_bounded() -> None:
     ear = Ear()
     with plugged() as pty:
         transport, _ = await filled(pty, ear)
-        transport.write(bytes(MOST_UNSENT - transport.get_write_buffer_size()))
+        transport.write(bytes(MAX_UNSENT - transport.get_write_buffer_size()))
         assert not transport.is_closing()
         transport.write(b"x")
         assert transport.is_closing()
@@ -93,7 +93,7 @@ async def test_unplugged() -> None:
         assert (transport.is_closing(), ear.lost) == (True, [error])
 
 
-@pytest.mark.parametrize("verb", ["write", "look", "set_baudrate"])
+@pytest.mark.parametrize("verb", ["write", "poll_input", "set_baudrate"])
 async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
     """Reported once, though the loop finds it out as well; and not from within the call."""
     ear = Ear()
@@ -102,7 +102,7 @@ async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
         pty.unplug()
         calls: dict[str, Callable[[], object]] = {
             "write": lambda: transport.write(b"x"),
-            "look": transport.look,
+            "poll_input": transport.look,
             "set_baudrate": lambda: transport.set_baudrate(9_600),
         }
         calls[verb]()

@@ -24,21 +24,21 @@ class Server:
         self.port = 0
         self.reader: asyncio.StreamReader
         self.writer: asyncio.StreamWriter
-        self._met = asyncio.Event()
+        self._connected = asyncio.Event()
 
-    def meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader, self.writer = reader, writer
-        self._met.set()
+        self._connected.set()
 
-    async def met(self) -> None:
+    async def connected(self) -> None:
         async with asyncio.timeout(PATIENCE):
-            await self._met.wait()
+            await self._connected.wait()
 
 
 @asynccontextmanager
 async def serving() -> AsyncIterator[Server]:
     server = Server()
-    listener = await asyncio.start_server(server.meet, "127.0.0.1", 0)
+    listener = await asyncio.start_server(server.accept, "127.0.0.1", 0)
     server.port = listener.sockets[0].getsockname()[1]
     try:
         yield server
@@ -55,12 +55,12 @@ async def test_both_ways() -> None:
     async with serving() as server:
         transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
         assert ear.made == 1
-        await server.met()
+        await server.connected()
         transport.write(b"question")
         assert await server.reader.readexactly(8) == b"question"
         server.writer.write(b"answer")
         assert await ear.until(6) == b"answer"
-        assert not transport.look()
+        assert not transport.poll_input()
         transport.abort()
         assert await ear.gone() is None
 
@@ -70,7 +70,7 @@ async def test_the_server_closes() -> None:
     ear = Ear()
     async with serving() as server:
         transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
-        await server.met()
+        await server.connected()
         server.writer.close()
         error = await ear.gone()
         assert isinstance(error, LinkDown)
@@ -87,7 +87,7 @@ async def test_the_connection_breaks() -> None:
     ear = Ear()
     async with serving() as server:
         await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
-        await server.met()
+        await server.connected()
         server.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         server.writer.transport.abort()
         error = await ear.gone()
@@ -101,7 +101,7 @@ async def test_who_closes_is_heard_to_the_end() -> None:
     ear, much = Ear(), bytes(30_000)
     async with serving() as server:
         transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
-        await server.met()
+        await server.connected()
         transport.write(much)
         transport.close()
         transport.write(b"too late")
@@ -115,7 +115,7 @@ async def test_what_waits_for_the_server_is_bounded() -> None:
     ear = Ear()
     async with serving() as server:
         transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
-        await server.met()
+        await server.connected()
         server.writer.transport.pause_reading()  # type: ignore[attr-defined]  # a stream's transport reads as well
         for _ in range(100_000):
             transport.write(bytes(1000))

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from servobus.errors import LinkDown
-from servobus.remote.cache import Mirror, Newest, received
+from servobus.remote.cache import LatestSnapshot, StateCache, received
 from servobus.values import State
 
 NAMES = {"arm/a": ("arm", "a"), "arm/b": ("arm", "b")}
@@ -20,7 +20,7 @@ def test_times_are_of_this_machine() -> None:
 
 
 def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
-    mirror = Mirror()
+    mirror = StateCache()
     mirror.names = NAMES
     mirror.know({"arm/b": State(position=1.0, time=99.0, age=0.1, health="online"), "arm/gone": State()})
     assert mirror.snapshot(102.0) == {"arm/a": State(), "arm/b": State(position=1.0, time=99.0, age=3.0, health="online")}
@@ -29,7 +29,7 @@ def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
 
 
 def test_without_a_daemon_everything_is_offline_and_figures_are_none() -> None:
-    mirror = Mirror()
+    mirror = StateCache()
     mirror.names = NAMES
     mirror.know({"arm/b": State(position=1.0, time=99.0, health="online")})
     mirror.counted({"arm": {}})
@@ -41,7 +41,7 @@ def test_without_a_daemon_everything_is_offline_and_figures_are_none() -> None:
 
 
 async def test_the_newest_replaces_what_was_not_fetched() -> None:
-    newest = Newest()
+    newest = LatestSnapshot()
     waiting = asyncio.create_task(newest.get())
     await asyncio.sleep(0)
     newest.put({"a": State(position=1.0)})

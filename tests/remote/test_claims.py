@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from servobus.remote.claims import Claims
+from servobus.remote.claims import HeldLeases
 
 A, B = "arm/a", "arm/b"
 
 
-def claims() -> Claims:
-    made = Claims()
+def claims() -> HeldLeases:
+    made = HeldLeases()
     made.ttl = 0.5
     return made
 

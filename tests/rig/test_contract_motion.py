@@ -80,7 +80,7 @@ async def test_a_goal_that_is_none(over: Over, tmp_path: Path, value: Any) -> No
         {"speed": 1, "duration": 1},
         {"effort": 101},
         {"acceleration": True},
-        {"deadline": "soon"},
+        {"start_within": "soon"},
     ],
 )
 @both
@@ -122,7 +122,7 @@ async def test_a_part_that_fails(over: Over, tmp_path: Path) -> None:
         assert isinstance(error, GoalExpired)
         assert (error.bus, error.servo) == ("arm", "s2")
         with pytest.raises(GoalExpired):
-            await rig["s2"].move_to(5, deadline=0.05)
+            await rig["s2"].move_to(5, start_within=0.05)
         with pytest.raises(PartialFailure) as caught:
             await rig.disable()
         assert caught.value.results["arm/s1"] is None
@@ -226,7 +226,7 @@ async def test_events(over: Over, tmp_path: Path) -> None:
 @virtual
 async def test_a_line_that_goes_and_comes(over: Over, tmp_path: Path) -> None:
     async with over(config(poll="{feedback: 50}"), tmp_path) as (rig, home):
-        link = home.keepers["arm"].link
+        link = home.supervisors["arm"].link
         link.unplug()  # type: ignore[attr-defined]
         with pytest.raises(LinkDown, match="arm"):
             await rig.read("s1")

@@ -13,14 +13,14 @@ from servobus.rig.opening import open_rig
 from servobus.values import Outcome
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
-from tests.wire_log import GOAL, TORQUE, Wire, energised, frames
+from tests.wire_log import GOAL, TORQUE, WireLog, energised, frames
 
 # Start
 
 
 @virtual
 async def test_start_asks_and_writes_nothing() -> None:
-    wire = Wire()
+    wire = WireLog()
     async with open_rig(config(poll="{feedback: 50, health: 1}"), trace=wire) as rig:
         await asyncio.sleep(1)
         assert not any(energised(device) for device in devices(rig).values())
@@ -47,7 +47,7 @@ async def test_a_missing_servo_is_no_error_at_start_and_is_found_when_it_comes()
 
 @virtual
 async def test_enable_takes_the_present_position_as_goal_before_torque() -> None:
-    wire = Wire()
+    wire = WireLog()
     async with open_rig(config("s1: {id: 1, model: sts, zero: 2048}"), trace=wire) as rig:
         device = devices(rig)[1]
         device.joint.position = 1000.0
@@ -103,7 +103,7 @@ async def test_clamp_sends_the_nearest_and_reports_it() -> None:
 
 @virtual
 async def test_goals_of_one_moment_leave_in_one_frame() -> None:
-    wire = Wire()
+    wire = WireLog()
     async with open_rig(config(), trace=wire) as rig:
         await rig.enable()
         wire.said.clear()
@@ -131,7 +131,7 @@ async def test_a_goal_too_old_is_dropped_and_said_so() -> None:
         with pytest.raises(ReplyTimeout):
             await rig.read("s1")
         with pytest.raises(GoalExpired, match="s1"):
-            await rig["s1"].move_to(5, deadline=0.05)
+            await rig["s1"].move_to(5, start_within=0.05)
         device.dead = False
         await asyncio.sleep(5)
         assert device.get(GOAL) == before

@@ -23,7 +23,7 @@ from servobus.rig.opening import open_rig
 from servobus.values import Goal, Outcome
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
-from tests.wire_log import GOAL, Wire, energised, frames
+from tests.wire_log import GOAL, WireLog, energised, frames
 
 # Stop
 
@@ -122,10 +122,10 @@ async def test_a_restarted_servo_is_disabled_and_its_goal_is_not_said_again() ->
 
 @virtual
 async def test_unplug_fails_what_waits_and_replug_sends_no_old_goal() -> None:
-    wire = Wire()
+    wire = WireLog()
     async with open_rig(config(poll="{feedback: 50}"), trace=wire) as rig:
         await rig.enable()
-        link = rig.keepers["arm"].link
+        link = rig.supervisors["arm"].link
         waiting = [asyncio.create_task(rig.read(f"s{number}")) for number in (1, 2, 3)]
         moving = asyncio.create_task(rig.move({"s1": 50, "s2": 50}))
         await asyncio.sleep(0)

@@ -67,8 +67,8 @@ async def test_one_that_is_not_enabled_is_left_alone() -> None:
 async def test_on_a_line_that_is_down_it_says_so() -> None:
     async with open_rig(config(HOLD)) as rig:
         await rig.enable()
-        rig.keepers["arm"].scope.cancel()
-        await rig.keepers["arm"].bus.master.close()
+        rig.supervisors["arm"].scope.cancel()
+        await rig.supervisors["arm"].bus.master.close()
         report = (await rig.abandon(["arm/s1"]))["arm/s1"]
         assert (report.written, report.confirmed) == (False, False)
         assert "line is down" in report.detail

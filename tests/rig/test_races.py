@@ -118,7 +118,7 @@ async def test_no_session_while_something_is_being_enabled() -> None:
 async def test_an_e_stop_of_a_line_that_is_down_is_said_when_it_is_back() -> None:
     async with open_rig(config(LIMP)) as rig:
         await rig.enable()
-        link = rig.keepers["arm"].link
+        link = rig.supervisors["arm"].link
         link.unplug()  # type: ignore[attr-defined]
         await asyncio.sleep(0.01)
         assert rig.snapshot()["arm/s1"].health != "online"

@@ -60,7 +60,7 @@ async def test_a_changed_bus_is_left_as_at_exit_and_the_others_go_on(path: Path)
         assert rig.left["arm/s1"].confirmed
         assert rig.buses["leg"] is leg
         assert rig.snapshot()["leg/s2"].enabled
-        await rig.keepers["arm"].tried.wait()
+        await rig.supervisors["arm"].tried.wait()
         assert list(devices(rig)) == [7]
         assert (await rig["s1"].read()).enabled is False
 
@@ -77,7 +77,7 @@ async def test_buses_come_and_go(path: Path) -> None:
             await waiting
         with pytest.raises(UnknownName, match="arm/s1, hip/s9"):
             rig["leg/s2"]
-        await rig.keepers["hip"].tried.wait()
+        await rig.supervisors["hip"].tried.wait()
         assert (await rig["s9"].read()).position == 0
 
 
@@ -100,7 +100,7 @@ async def test_the_e_stop_holds_on_new_buses_too(path: Path) -> None:
         write(path, TWO.replace("id: 1,", "id: 7,"))
         await rig.reload()
         assert rig.stopped
-        await rig.keepers["arm"].tried.wait()
+        await rig.supervisors["arm"].tried.wait()
         with pytest.raises(EStopped):
             await rig["s1"].enable()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from servobus.protocols.definition import ProtocolEntry
+from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.kst.codec import KstCodec, node_of, rename
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.model_loading import load_models
@@ -17,7 +17,7 @@ def codec(options: KstBus | None = None) -> KstCodec:
     return KstCodec(options.version_byte, strict=options.pad_check == "strict")
 
 
-ENTRY = ProtocolEntry(
+DEFINITION = ProtocolDefinition(
     options=KstBus,
     models=load_models,
     codec=codec,

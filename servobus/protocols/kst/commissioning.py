@@ -15,7 +15,7 @@ from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import SAVE_WORD, Command
 from servobus.protocols.kst.identity import look
 from servobus.protocols.kst.options import KstBus
-from servobus.protocols.kst.requests import Broadcast, Confirmed, Read, Save, Tell, Wire
+from servobus.protocols.kst.requests import Broadcast, Confirmed, FrameTiming, Read, Save, Tell
 from servobus.values import Change, known_command
 
 DOUBTFUL_ID = 0xFF
@@ -27,9 +27,9 @@ class Commissioning:
 
     commands: ClassVar = {"save": "writes its settings to flash"}
 
-    def __init__(self, options: KstBus, wire: Wire) -> None:
+    def __init__(self, options: KstBus, timing: FrameTiming) -> None:
         self.options = options
-        self.wire = wire
+        self.timing = timing
         self.pending: dict[int, Change] = {}
 
     def set_id(self, node: int, new: int, *, save: bool = False) -> Plan[Change]:
@@ -63,10 +63,10 @@ class Commissioning:
         """Write the servo's settings to its flash, once. Returns what a person should know of it."""
         notes: tuple[str, ...] = ()
         if self.options.save_reply == "none":
-            yield from ask(Tell(self.wire, node, Command.SAVE, SAVE_WORD))
+            yield from ask(Tell(self.timing, node, Command.SAVE, SAVE_WORD))
         else:
             try:
-                yield from ask(Save(self.wire, node))
+                yield from ask(Save(self.timing, node))
             except (ReplyTimeout, DeviceError) as error:
                 if self.options.save_reply == "required":
                     raise
@@ -89,7 +89,7 @@ class Commissioning:
 
     def lone_id(self) -> Plan[int]:
         """The id of the only servo on the line, asked of all. Raises NotSupported where the config does not allow that."""
-        return self._ask_all(Broadcast(self.wire, self.options, Command.READ_ID))
+        return self._ask_all(Broadcast(self.timing, self.options, Command.READ_ID))
 
     def own_ids(self, node: int) -> tuple[int, ...]:
         """What the servo at this address may say its id is: the seed does not tell whether a new one shows before the restart."""
@@ -111,10 +111,10 @@ class Commissioning:
         moves = change.what == "id" and immediate
         if change.what == "id" and change.value != change.node:
             yield from self._expect_silence(change.value)
-        suspicion = (yield from look(self.wire, change.node)).suspicion
+        suspicion = (yield from look(self.timing, change.node)).suspicion
         if suspicion:
             raise DeviceError(f"{suspicion}. Nothing was changed")
-        yield from ask(Confirmed(self.wire, change.node, command, bytes((value,)), also=value if moves else None))
+        yield from ask(Confirmed(self.timing, change.node, command, bytes((value,)), also=value if moves else None))
         if immediate:
             change = replace(change, pending_reboot=False)
         else:
@@ -139,7 +139,7 @@ class Commissioning:
             raise DeviceError(f"after {change.what} {change.value} was set, the servo says its id is {said}: do not save it")
 
     def _read_id(self, node: int) -> Read[int]:
-        return Read(self.wire, node, Command.READ_ID, lambda data: data[0], once=True)
+        return Read(self.timing, node, Command.READ_ID, lambda data: data[0], once=True)
 
 
 def _id_notes(new: int) -> Iterator[str]:

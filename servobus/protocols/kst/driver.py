@@ -12,13 +12,13 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
-from servobus.protocols.base import GoalTurn, PlainDriver, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalPlan, PlainDriver, Plan, Poll, Request, ask
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
 from servobus.protocols.kst.commissioning import Commissioning
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
-from servobus.protocols.kst.requests import Fence, Read, Wire
+from servobus.protocols.kst.requests import Fence, FrameTiming, Read
 from servobus.protocols.kst.servo import FittedServo
 from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
@@ -37,8 +37,8 @@ class KstDriver(PlainDriver):
         self.servos = {name: FittedServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.by_node = {servo.node: servo for servo in self.servos.values()}
         self.nodes = {name: servo.node for name, servo in self.servos.items()}
-        self.wire = Wire.of(options)
-        self.commissioning = Commissioning(options, self.wire)
+        self.timing = FrameTiming.of(options)
+        self.commissioning = Commissioning(options, self.timing)
         # Requests are immutable, and the same few are said again and again.
         self._state_reads = {
             (name, part): self._state_read(name, part) for name in self.servos for part in ("feedback", "health")
@@ -52,14 +52,14 @@ class KstDriver(PlainDriver):
 
     def ping(self, node: int) -> Request[int | None]:
         """Read id (3.4). There is no status byte."""
-        return Read(self.wire, node, Command.READ_ID, _nothing)
+        return Read(self.timing, node, Command.READ_ID, _nothing)
 
     def unused(self) -> Request[Any]:
         first, last = self.options.id_range
         free = (node for node in range(last, first - 1, -1) if node not in self.by_node)
-        return Read(self.wire, next(free, last), Command.READ_ID, _nothing, once=True)
+        return Read(self.timing, next(free, last), Command.READ_ID, _nothing, once=True)
 
-    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         """There is one form of each read only, so fences take turns: the answer to a fence that was given up must not be taken
         for the next one's. An enabled servo that stands where nobody sent it has restarted."""
         used = list(avoid)
@@ -72,29 +72,29 @@ class KstDriver(PlainDriver):
         return (yield from self._recover(node, fence_command(used), enabled))
 
     def _recover(self, node: int, command: Command, enabled: bool) -> Plan[bool]:
-        yield from ask(Fence(self.wire, node, command, self.commissioning.own_ids(node)))
+        yield from ask(Fence(self.timing, node, command, self.commissioning.own_ids(node)))
         servo = self.by_node.get(node)
         if servo is None or not enabled:
             return True
         try:
             # Once: behind the fence, nothing would tell the answer to a second question from that to the first.
-            servo.seen((yield from ask(Read(self.wire, node, Command.READ_POSITION, decode_position, once=True))))
+            servo.seen((yield from ask(Read(self.timing, node, Command.READ_POSITION, decode_position, once=True))))
         except DeviceError:
             return True  # it refuses to say
         return not servo.jumped
 
     def inspect(self, node: int) -> Plan[Identity]:
-        return identity.inspect(self.wire, node)
+        return identity.inspect(self.timing, node)
 
     def identify(self, servo: str) -> Plan[Identity]:
         return self._identify(self.servos[servo])
 
     def _identify(self, servo: FittedServo) -> Plan[Identity]:
-        seen = yield from identity.identify(self.wire, servo.node)
+        seen = yield from identity.identify(self.timing, servo.node)
         notes = [*seen.notes]
         if servo.node in self.commissioning.pending:
             notes.append(str(self.commissioning.pending[servo.node]))
-        if self.options.sdo_order == "auto" and self.wire.aborts.learned == "le":
+        if self.options.sdo_order == "auto" and self.timing.aborts.learned == "le":
             notes.append("its abort codes come low byte first, not as the specification prints them")
         return replace(seen, mode="position", notes=tuple(notes))
 
@@ -121,7 +121,7 @@ class KstDriver(PlainDriver):
             command, decode = Command.READ_POSITION, fitted.decode_position
         else:
             command, decode = Command.READ_STATUS, fitted.decode_status
-        return Read(self.wire, fitted.node, command, lambda data: {servo: decode(data)})
+        return Read(self.timing, fitted.node, command, lambda data: {servo: decode(data)})
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
         known = self._reads.get((servo, register, raw))
@@ -135,7 +135,7 @@ class KstDriver(PlainDriver):
             Command.READ_STATUS: _word,
             Command.READ_VERSION: _double_word if raw else version_text,
         }
-        request = self._reads[servo, register, raw] = Read(self.wire, fitted.node, command, makers[command])
+        request = self._reads[servo, register, raw] = Read(self.timing, fitted.node, command, makers[command])
         return request
 
     # Writing
@@ -151,8 +151,8 @@ class KstDriver(PlainDriver):
         """Opens the host's gate: reads the position and writes nothing, for there is no torque command, and a reading that is
         not the goal would move the servo if it were written."""
         fitted = self.servos[servo]
-        raw = yield from ask(Read(self.wire, fitted.node, Command.READ_POSITION, fitted.position_of))
-        self.wire.aborts.faulty.discard(fitted.node)
+        raw = yield from ask(Read(self.timing, fitted.node, Command.READ_POSITION, fitted.position_of))
+        self.timing.aborts.faulty.discard(fitted.node)
         fitted.enabled(raw)
         return fitted.to_unit(raw)
 
@@ -160,7 +160,7 @@ class KstDriver(PlainDriver):
         return goals.disable(self.servos[servo])
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
-        return goals.stop(self.wire, [(self.servos[target.servo], target) for target in targets])
+        return goals.stop(self.timing, [(self.servos[target.servo], target) for target in targets])
 
     def check_goal(self, goal: ServoGoal) -> None:
         if goal.servo not in self.servos:
@@ -173,11 +173,11 @@ class KstDriver(PlainDriver):
                 raise NotSupported(f"{what}: a KST servo has no command for it: take it out", servo=servo.name)
         if wanted.speed == 0 and not servo.options.allow_max_speed:
             raise LimitError("speed 0 means no limit: give a speed, or set allow_max_speed", servo=servo.name)
-        goals.refuse_faulty(self.wire, servo)
+        goals.refuse_faulty(self.timing, servo)
         servo.to_raw(wanted.value)
-        self.pace(goal)
+        self.host_speed(goal)
 
-    def pace(self, goal: ServoGoal) -> float | None:
+    def host_speed(self, goal: ServoGoal) -> float | None:
         """The goal's own speed, else the servo's, else its greatest, else the model's: left alone it goes as fast as it can."""
         servo, wanted = self.servos[goal.servo], goal.goal
         if wanted.speed == 0:
@@ -188,10 +188,10 @@ class KstDriver(PlainDriver):
             return wanted.speed or servo.default_speed
         return abs(wanted.value - goal.start) / wanted.duration or None
 
-    def plan(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
+    def plan_goals(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
         """Each goal is confirmed by its echo, asked for or not."""
         steps = [(self.servos[goal.servo], self.servos[goal.servo].to_raw(goal.goal.value)) for goal in goals_]
-        return goals.turns(self.wire, steps, together=together)
+        return goals.turns(self.timing, steps, together=together)
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
         """Bits of the status bytes that the config names, and what the host has found out itself."""
@@ -200,7 +200,7 @@ class KstDriver(PlainDriver):
         names = {**fitted.model.status_bits, **self.options.status_bits}
         found = [name for bit, name in sorted(names.items()) if bits is not None and bits >> bit & 1]
         own = {
-            "hardware fault": fitted.node in self.wire.aborts.faulty,
+            "hardware fault": fitted.node in self.timing.aborts.faulty,
             "outside range": fitted.outside,
             "restarted": fitted.jumped,
             "pending_reboot": fitted.node in self.commissioning.pending,

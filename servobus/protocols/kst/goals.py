@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from servobus.errors import ReplyTimeout, ServobusError
-from servobus.protocols.base import GoalTurn, Plan, ask
+from servobus.protocols.base import GoalPlan, Plan, ask
 from servobus.protocols.kst.aborts import HardwareFault
 from servobus.protocols.kst.codec import Command, encode_position
-from servobus.protocols.kst.requests import Confirmed, Read, Tell, Wire
+from servobus.protocols.kst.requests import Confirmed, FrameTiming, Read, Tell
 from servobus.protocols.kst.servo import FittedServo
 from servobus.values import Outcome, StopReport, StopTarget
 
@@ -25,29 +25,29 @@ Step = tuple[FittedServo, int]
 """A servo and where it shall go, in steps."""
 
 
-def turns(wire: Wire, steps: Sequence[Step], *, together: bool) -> list[GoalTurn]:
+def turns(timing: FrameTiming, steps: Sequence[Step], *, together: bool) -> list[GoalPlan]:
     """One turn for each goal, or one plan for all."""
     groups = [list(steps)] if together and steps else [[step] for step in steps]
-    return [GoalTurn(tuple(servo.name for servo, _ in group), set_all(wire, group), len(group)) for group in groups]
+    return [GoalPlan(tuple(servo.name for servo, _ in group), set_all(timing, group), len(group)) for group in groups]
 
 
-def set_all(wire: Wire, steps: Sequence[Step]) -> Plan[Results]:
+def set_all(timing: FrameTiming, steps: Sequence[Step]) -> Plan[Results]:
     """One after the other; what one refuses does not keep the others."""
     results: Results = {}
     for servo, raw in steps:
         try:
-            yield from set_position(wire, servo, raw)
+            yield from set_position(timing, servo, raw)
             results[servo.name] = Outcome.ACKED
         except ServobusError as error:
             results[servo.name] = error.at(servo=servo.name)
     return results
 
 
-def set_position(wire: Wire, servo: FittedServo, raw: int) -> Plan[None]:
+def set_position(timing: FrameTiming, servo: FittedServo, raw: int) -> Plan[None]:
     """Raises HardwareFault, unsent, while one is latched."""
-    refuse_faulty(wire, servo)
+    refuse_faulty(timing, servo)
     try:
-        yield from ask(Confirmed(wire, servo.node, Command.SET_POSITION, encode_position(raw)))
+        yield from ask(Confirmed(timing, servo.node, Command.SET_POSITION, encode_position(raw)))
     except ReplyTimeout:
         servo.sent(raw)  # it may have been obeyed
         raise
@@ -55,8 +55,8 @@ def set_position(wire: Wire, servo: FittedServo, raw: int) -> Plan[None]:
     servo.confirmed(raw)
 
 
-def refuse_faulty(wire: Wire, servo: FittedServo) -> None:
-    if servo.node in wire.aborts.faulty:
+def refuse_faulty(timing: FrameTiming, servo: FittedServo) -> None:
+    if servo.node in timing.aborts.faulty:
         raise HardwareFault(
             "the servo has reported a hardware fault (0606 0000): nothing was sent. Look after it, then enable it again",
             code=0x06060000,
@@ -64,7 +64,7 @@ def refuse_faulty(wire: Wire, servo: FittedServo) -> None:
         )
 
 
-def stop(wire: Wire, targets: Sequence[tuple[FittedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
+def stop(timing: FrameTiming, targets: Sequence[tuple[FittedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
     """Hold, also in place of limp. First the servos that answer; then, twice and unanswered, those that do not."""
     reports: dict[str, StopReport] = {}
     silent: list[tuple[FittedServo, str]] = []
@@ -75,34 +75,34 @@ def stop(wire: Wire, targets: Sequence[tuple[FittedServo, StopTarget]]) -> Plan[
             silent.append((servo, "offline: nothing was confirmed"))
         else:
             try:
-                yield from _hold(wire, servo)
+                yield from _hold(timing, servo)
                 reports[servo.name] = StopReport("hold", True, True, HOLDS if target.kind == "limp" else "")
             except ServobusError as error:
                 silent.append((servo, str(error)))
         if target.kind == "limp":
             servo.disabled()
     for servo, reason in silent:
-        reports[servo.name] = yield from _hold_unheard(wire, servo, reason)
+        reports[servo.name] = yield from _hold_unheard(timing, servo, reason)
     return {servo.name: reports[servo.name] for servo, _ in targets}
 
 
-def _hold(wire: Wire, servo: FittedServo) -> Plan[None]:
+def _hold(timing: FrameTiming, servo: FittedServo) -> Plan[None]:
     """Goal := resting place, which is asked for where it is not known. A latched hardware fault does not keep it back."""
     if servo.resting_place is None:
-        yield from ask(Read(wire, servo.node, Command.READ_POSITION, servo.position_of))
+        yield from ask(Read(timing, servo.node, Command.READ_POSITION, servo.position_of))
     raw = servo.resting_place
     assert raw is not None
-    yield from ask(Confirmed(wire, servo.node, Command.SET_POSITION, encode_position(raw)))
+    yield from ask(Confirmed(timing, servo.node, Command.SET_POSITION, encode_position(raw)))
     servo.sent(raw)
     servo.confirmed(raw)
 
 
-def _hold_unheard(wire: Wire, servo: FittedServo, reason: str) -> Plan[StopReport]:
+def _hold_unheard(timing: FrameTiming, servo: FittedServo, reason: str) -> Plan[StopReport]:
     raw = servo.resting_place
     if raw is None:
         return StopReport("hold", False, False, f"{reason}; nothing was written, for its position is not known")
     for _ in range(TIMES):
-        yield from ask(Tell(wire, servo.node, Command.SET_POSITION, encode_position(raw)))
+        yield from ask(Tell(timing, servo.node, Command.SET_POSITION, encode_position(raw)))
     return StopReport("hold", True, False, reason)
 
 

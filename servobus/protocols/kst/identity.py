@@ -14,7 +14,7 @@ from typing import TypeVar
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import FACTORY_ID, Command, decode_position, version_text
-from servobus.protocols.kst.requests import Read, Wire
+from servobus.protocols.kst.requests import FrameTiming, Read
 from servobus.values import Identity
 
 R = TypeVar("R")
@@ -66,14 +66,14 @@ class Sighting:
         return version_text(self.versions[0]) if self.versions else None
 
 
-def look(wire: Wire, node: int, *, at_rest: bool = True) -> Plan[Sighting]:
+def look(timing: FrameTiming, node: int, *, at_rest: bool = True) -> Plan[Sighting]:
     """Ask several times. Raises ReplyTimeout where nothing answers at all."""
     seen = Sighting(node, at_rest)
     error: ReplyTimeout | None = None
     for _ in range(LOOKS):
         for question in (
-            _note(seen.versions, Read(wire, node, Command.READ_VERSION, _version, once=True)),
-            _note(seen.positions, Read(wire, node, Command.READ_POSITION, decode_position, once=True)),
+            _note(seen.versions, Read(timing, node, Command.READ_VERSION, _version, once=True)),
+            _note(seen.positions, Read(timing, node, Command.READ_POSITION, decode_position, once=True)),
         ):
             try:
                 yield from question
@@ -90,18 +90,18 @@ def _note(heard: list[R], request: Read[R]) -> Plan[None]:
     heard.append((yield from ask(request)))
 
 
-def inspect(wire: Wire, node: int, *, at_rest: bool = True) -> Plan[Identity]:
+def inspect(timing: FrameTiming, node: int, *, at_rest: bool = True) -> Plan[Identity]:
     """For a scan: with the question whether it is one servo."""
-    seen = yield from look(wire, node, at_rest=at_rest)
+    seen = yield from look(timing, node, at_rest=at_rest)
     return Identity(model="kst", firmware=seen.firmware, notes=tuple(filter(None, (seen.suspicion,))))
 
 
-def identify(wire: Wire, node: int) -> Plan[Identity]:
+def identify(timing: FrameTiming, node: int) -> Plan[Identity]:
     """For a configured servo: in short, unless it has the id of every new one."""
     if node == FACTORY_ID:
-        return (yield from inspect(wire, node, at_rest=False))
+        return (yield from inspect(timing, node, at_rest=False))
     try:
-        firmware = version_text((yield from ask(Read(wire, node, Command.READ_VERSION, _version))))
+        firmware = version_text((yield from ask(Read(timing, node, Command.READ_VERSION, _version))))
     except DeviceError:
         firmware = None  # it answers, and does not know that command
     return Identity(model="kst", firmware=firmware)

@@ -22,7 +22,7 @@ class KstServo(ServoOptions):
     """kst, or the path of an own model file (*.yaml, relative to the config)."""
     range_deg: Pair[Finite] | None = None
     """Degrees, as the servo counts them, that it may be sent to; None: the model's -90 to +90. What is outside is refused
-    before the wire, whatever `on_limit` says: that clamps to `limits`."""
+    before the timing, whatever `on_limit` says: that clamps to `limits`."""
 
     @field_validator("on_estop", "on_exit", "on_lost_client")
     @classmethod

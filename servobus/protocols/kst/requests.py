@@ -24,7 +24,7 @@ TURNAROUND = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Wire:
+class FrameTiming:
     """What every request of a bus has in common."""
 
     aborts: AbortReader = field(default_factory=AbortReader)
@@ -38,7 +38,7 @@ class Wire:
     strict_echo: bool = True
 
     @classmethod
-    def of(cls, options: KstBus) -> Wire:
+    def of(cls, options: KstBus) -> FrameTiming:
         return cls(
             AbortReader(options.sdo_order),
             options.version_byte,
@@ -52,16 +52,16 @@ class Wire:
 class KstRequest(Request[R]):
     """A command that is answered by one frame."""
 
-    def __init__(self, wire: Wire, node: int, command: int, data: bytes = b"") -> None:
-        self.wire = wire
+    def __init__(self, timing: FrameTiming, node: int, command: int, data: bytes = b"") -> None:
+        self.timing = timing
         self.node = node
         self.command = command
         self.data = data
-        self.frame = encode(node, command, data, wire.version)
+        self.frame = encode(node, command, data, timing.version)
         self.nodes = (node,) if node != BROADCAST else ()
         self.reply_size = SIZE
         self.reply_key: int = command
-        self.quiet_after = wire.gap
+        self.quiet_after = timing.gap
 
     def answers(self, reply: Frame) -> bool:
         return reply.address == self.node and reply.code in (REPLY + self.command, REFUSED + self.command)
@@ -69,7 +69,7 @@ class KstRequest(Request[R]):
     def parse(self, replies: Sequence[Frame]) -> R:
         reply = replies[0]
         if reply.refused:
-            raise self.wire.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
+            raise self.timing.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
         return self.decode(reply)
 
     @abstractmethod
@@ -83,9 +83,11 @@ class KstRequest(Request[R]):
 class Read(KstRequest[R]):
     """Read id, position, status or version (3.4, 3.6 to 3.8); `make` makes the value of the eight data bytes."""
 
-    def __init__(self, wire: Wire, node: int, command: Command, make: Callable[[bytes], R], *, once: bool = False) -> None:
+    def __init__(
+        self, timing: FrameTiming, node: int, command: Command, make: Callable[[bytes], R], *, once: bool = False
+    ) -> None:
         """`once`: not said again when no answer comes."""
-        super().__init__(wire, node, command)
+        super().__init__(timing, node, command)
         self.idempotent = not once
         self._make = make
 
@@ -99,9 +101,9 @@ class Fence(KstRequest[None]):
 
     idempotent = False
 
-    def __init__(self, wire: Wire, node: int, command: Command, ids: Collection[int]) -> None:
+    def __init__(self, timing: FrameTiming, node: int, command: Command, ids: Collection[int]) -> None:
         """`ids`: what the servo may say its id is."""
-        super().__init__(wire, node, command)
+        super().__init__(timing, node, command)
         self._ids = ids
 
     def answers(self, reply: Frame) -> bool:
@@ -118,9 +120,9 @@ class Fence(KstRequest[None]):
 class Confirmed(KstRequest[None]):
     """A set: its reply brings back what was sent (3.1, 3.2, 3.5)."""
 
-    def __init__(self, wire: Wire, node: int, command: Command, data: bytes, *, also: int | None = None) -> None:
+    def __init__(self, timing: FrameTiming, node: int, command: Command, data: bytes, *, also: int | None = None) -> None:
         """`also`: another address the answer may come from."""
-        super().__init__(wire, node, command, data)
+        super().__init__(timing, node, command, data)
         self.idempotent = command == Command.SET_POSITION
         self._also = also
 
@@ -131,7 +133,7 @@ class Confirmed(KstRequest[None]):
 
     def decode(self, reply: Frame) -> None:
         heard = reply.data[: len(self.data)]
-        if self.wire.strict_echo and heard != self.data:
+        if self.timing.strict_echo and heard != self.data:
             raise EchoMismatch(
                 f"{name_of(self.command)}: {heard.hex(' ')} was confirmed, {self.data.hex(' ')} was sent: read it back before "
                 "the next one (echo_check: off believes it)",
@@ -145,9 +147,9 @@ class Save(KstRequest[None]):
 
     idempotent = False
 
-    def __init__(self, wire: Wire, node: int) -> None:
-        super().__init__(wire, node, Command.SAVE, SAVE_WORD)
-        self.service_time = self.quiet_after = wire.settle
+    def __init__(self, timing: FrameTiming, node: int) -> None:
+        super().__init__(timing, node, Command.SAVE, SAVE_WORD)
+        self.service_time = self.quiet_after = timing.settle
 
     def decode(self, reply: Frame) -> None:
         """Whatever it brings: the seed knows no data of it."""
@@ -158,11 +160,11 @@ class Tell(KstRequest[None]):
 
     replies = 0
 
-    def __init__(self, wire: Wire, node: int, command: Command, data: bytes = b"") -> None:
-        super().__init__(wire, node, command, data)
+    def __init__(self, timing: FrameTiming, node: int, command: Command, data: bytes = b"") -> None:
+        super().__init__(timing, node, command, data)
         self.nodes = ()
         self.idempotent = command == Command.SET_POSITION
-        self.quiet_after = max(wire.guard, wire.settle if command == Command.SAVE else 0.0)
+        self.quiet_after = max(timing.guard, timing.settle if command == Command.SAVE else 0.0)
 
     def parse(self, replies: Sequence[Frame]) -> None:
         """It has no answer."""
@@ -177,16 +179,16 @@ class Broadcast(KstRequest[Frame | None]):
 
     idempotent = False
 
-    def __init__(self, wire: Wire, options: KstBus, command: Command, data: bytes = b"") -> None:
+    def __init__(self, timing: FrameTiming, options: KstBus, command: Command, data: bytes = b"") -> None:
         if command not in options.broadcast_allow:
             raise NotSupported(
                 f"{name_of(command)} is not said to all, for every servo would obey or answer at once: name one, or see "
                 "broadcast_allow"
             )
-        super().__init__(wire, BROADCAST, command, data)
+        super().__init__(timing, BROADCAST, command, data)
         if options.broadcast_reply == "ignore":
             self.replies = 0
-            self.quiet_after = wire.guard
+            self.quiet_after = timing.guard
 
     def answers(self, reply: Frame) -> bool:
         """From whatever address."""

@@ -32,7 +32,7 @@ from servobus.protocols.modbus.codec import (
 
 R = TypeVar("R")
 
-LEAST_GAP = 0.00175
+MIN_GAP = 0.00175
 """Seconds between two frames above 19200 baud."""
 GAP_CHARACTERS = 3.5
 CHARACTER_BITS = 11
@@ -59,27 +59,27 @@ GATEWAY = frozenset({0x0A, NO_ANSWER})
 
 
 @dataclass(frozen=True, slots=True)
-class Wire:
+class FrameTiming:
     """What every request of a line has in common. Seconds."""
 
-    gap: float = LEAST_GAP
+    gap: float = MIN_GAP
     """Silence between two frames."""
     turnaround: float = TURNAROUND
     """More silence after a broadcast."""
-    guard: float = LEAST_GAP + PATIENCE
+    guard: float = MIN_GAP + PATIENCE
     """Silence after what is told to a unit that does not answer: time for an answer that comes nevertheless."""
 
     @classmethod
-    def at(cls, baudrate: int, turnaround: float = TURNAROUND) -> Wire:
+    def at(cls, baudrate: int, turnaround: float = TURNAROUND) -> FrameTiming:
         """3.5 characters, and not below 1.75 ms."""
-        gap = max(LEAST_GAP, GAP_CHARACTERS * CHARACTER_BITS / baudrate)
+        gap = max(MIN_GAP, GAP_CHARACTERS * CHARACTER_BITS / baudrate)
         return cls(gap, turnaround, gap + PATIENCE + WRITE_SIZE * CHARACTER_BITS / baudrate)
 
 
 class ModbusRequest(Request[R]):
     """One question to one unit, or a write to all of them."""
 
-    def __init__(self, wire: Wire, unit: int, function: Function, body: bytes, told: bytes, size: int) -> None:
+    def __init__(self, timing: FrameTiming, unit: int, function: Function, body: bytes, told: bytes, size: int) -> None:
         """`told`: what the answer repeats, from its third byte on; `size`: bytes of the answer."""
         self.node = unit
         self.frame = encode(unit, function, body)
@@ -89,7 +89,7 @@ class ModbusRequest(Request[R]):
         self.nodes = (unit,) if self.replies else ()
         self.reply_size = size
         self.reply_key = reply_key(function, told)
-        self.quiet_after = wire.gap if self.replies else wire.gap + wire.turnaround
+        self.quiet_after = timing.gap if self.replies else timing.gap + timing.turnaround
 
     def answers(self, reply: Frame) -> bool:
         return reply.unit == self.node and (self._fits(reply) or reply.function == self.function | REFUSED)
@@ -118,11 +118,11 @@ class ModbusRequest(Request[R]):
 class ReadHolding(ModbusRequest[R]):
     """0x03: `count` registers from `address` on; `make` makes the value of them. Raises ValueError above 125."""
 
-    def __init__(self, wire: Wire, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R]) -> None:
+    def __init__(self, timing: FrameTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R]) -> None:
         if unit == BROADCAST or not 1 <= count <= MAX_READ:
             raise ValueError(f"a read asks one unit for 1 to {MAX_READ} registers, found unit {unit}, {count} registers")
         size = 2 * count
-        super().__init__(wire, unit, Function.READ_HOLDING, pack((address, count)), bytes((size,)), REPLY_OVERHEAD + size)
+        super().__init__(timing, unit, Function.READ_HOLDING, pack((address, count)), bytes((size,)), REPLY_OVERHEAD + size)
         self.address = address
         self.count = count
         self.make = make
@@ -151,10 +151,10 @@ class Fence(Probe[R]):
     idempotent = False
 
     def __init__(
-        self, wire: Wire, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R], *, refusable: bool
+        self, timing: FrameTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R], *, refusable: bool
     ) -> None:
         """`refusable`: no other read is under way, so that a refusal can only be of this one."""
-        super().__init__(wire, unit, address, count, make)
+        super().__init__(timing, unit, address, count, make)
         self.refusable = refusable
 
     def answers(self, reply: Frame) -> bool:
@@ -173,22 +173,22 @@ class WriteSingle(Write):
 
     mirrored = True
 
-    def __init__(self, wire: Wire, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
+    def __init__(self, timing: FrameTiming, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
         body = pack((address, value))
-        super().__init__(wire, unit, Function.WRITE_SINGLE, body, body, WRITE_SIZE)
+        super().__init__(timing, unit, Function.WRITE_SINGLE, body, body, WRITE_SIZE)
         self.idempotent = repeat
 
 
 class WriteMultiple(Write):
     """0x10: registers from `address` on. A unit may stop at the first it refuses, so a refused write may be applied in part."""
 
-    def __init__(self, wire: Wire, unit: int, address: int, values: Sequence[int], *, repeat: bool = True) -> None:
+    def __init__(self, timing: FrameTiming, unit: int, address: int, values: Sequence[int], *, repeat: bool = True) -> None:
         """`repeat`: may be said again when no answer came. Raises ValueError outside 1 to 123 values."""
         count = len(values)
         if not 1 <= count <= MAX_WRITE:
             raise ValueError(f"a write carries 1 to {MAX_WRITE} registers, found {count}")
         told = pack((address, count))
-        super().__init__(wire, unit, Function.WRITE_MULTIPLE, told + bytes((2 * count,)) + pack(values), told, READ_SIZE)
+        super().__init__(timing, unit, Function.WRITE_MULTIPLE, told + bytes((2 * count,)) + pack(values), told, READ_SIZE)
         self.idempotent = repeat
         self.address = address
         self.count = count
@@ -199,8 +199,8 @@ class Tell(WriteMultiple):
 
     replies = 0
 
-    def __init__(self, wire: Wire, unit: int, address: int, values: Sequence[int]) -> None:
-        super().__init__(wire, unit, address, values)
+    def __init__(self, timing: FrameTiming, unit: int, address: int, values: Sequence[int]) -> None:
+        super().__init__(timing, unit, address, values)
         self.replies = 0
         self.nodes = ()
-        self.quiet_after = wire.guard
+        self.quiet_after = timing.guard

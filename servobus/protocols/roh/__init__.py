@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from servobus.protocols.definition import ProtocolEntry
+from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.modbus.codec import MAX_UNIT, ModbusCodec, node_of, rename
 from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.model import CHANNELS
@@ -25,7 +25,7 @@ def fingers(unit: int, model: str) -> dict[str, dict[str, Any]]:
     return {f"{channel}_{unit}": {"id": unit, "channel": channel} for channel in CHANNELS}
 
 
-ENTRY = ProtocolEntry(
+DEFINITION = ProtocolDefinition(
     options=RohBus,
     models=load_models,
     codec=codec,

@@ -63,14 +63,14 @@ class Commissioning:
     def _set_unit(self, hand: Hand, new: int) -> Plan[Change]:
         taken = True
         try:
-            yield from ask(ReadHolding(hand.wire, new, hand.probe().address, 1, list))
+            yield from ask(ReadHolding(hand.timing, new, hand.probe().address, 1, list))
         except ReplyTimeout:
             taken = False
         if taken:
             raise DeviceError(f"unit {new} answers already: two hands with one unit would talk at once. Choose a free one")
         yield from self._command(hand, "node_id", new)
         address = hand.map.named("node_id").address
-        request = ReadHolding(hand.wire, new, address, 1, lambda words: words[0] & 0xFF)
+        request = ReadHolding(hand.timing, new, address, 1, lambda words: words[0] & 0xFF)
         request.service_time = RESTART_PATIENCE
         told = yield from ask(request)
         if told != new:

@@ -13,9 +13,9 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, ServobusError, UnknownName
-from servobus.protocols.base import GoalTurn, LineTraits, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalPlan, LineTraits, Plan, Poll, Request, ask
 from servobus.protocols.modbus.codec import MAX_UNIT, Function
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, Probe, Wire
+from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, FrameTiming, Probe
 from servobus.protocols.roh import goals, stop
 from servobus.protocols.roh.commissioning import Commissioning
 from servobus.protocols.roh.finger import Finger
@@ -41,7 +41,7 @@ class RohDriver:
 
     def __init__(self, options: RohBus, models: Mapping[str, RohModel]) -> None:
         self.options = options
-        self.wire = Wire.at(options.baudrate, options.turnaround_ms / 1000)
+        self.timing = FrameTiming.at(options.baudrate, options.turnaround_ms / 1000)
         self.limits = Limits(*options.limits(LineTraits()))
         self.fingers = {name: Finger(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: finger.node for name, finger in self.fingers.items()}
@@ -53,7 +53,7 @@ class RohDriver:
 
     def _hand(self, unit: int) -> Hand:
         fingers = [finger for finger in self.fingers.values() if finger.node == unit]
-        hand = Hand(unit, fingers, self.options.map_of(unit), self._models, self.wire, self.limits)
+        hand = Hand(unit, fingers, self.options.map_of(unit), self._models, self.timing, self.limits)
         hand.single_writes = self.options.single_write == "single"
         return hand
 
@@ -64,7 +64,7 @@ class RohDriver:
         finger = self.fingers[servo]
         return finger, self.hands[finger.node]
 
-    def carries(self, traits: LineTraits) -> None:
+    def use_traits(self, traits: LineTraits) -> None:
         self.limits.read, self.limits.write = self.options.limits(traits)
         self._reads.clear()
 
@@ -79,13 +79,13 @@ class RohDriver:
 
     def ping(self, node: int) -> Request[int | None]:
         """Read the first register; a refusal is an answer too. There is no status byte."""
-        return Probe(self.wire, node, FIRST, 1, _nothing)
+        return Probe(self.timing, node, FIRST, 1, _nothing)
 
     def unused(self) -> Request[Any]:
         free = (unit for unit in range(MAX_UNIT, 0, -1) if unit not in self.hands)
-        return Fence(self.wire, next(free, MAX_UNIT), FIRST, 1, _nothing, refusable=True)
+        return Fence(self.timing, next(free, MAX_UNIT), FIRST, 1, _nothing, refusable=True)
 
-    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         """The map is looked at again on the way. A hand whose targets or settings are not what we left there has restarted."""
         hand = self._hand_of(node)
         used = [key[1][0] // 2 for key in avoid if isinstance(key, tuple) and key[0] == Function.READ_HOLDING]
@@ -105,7 +105,7 @@ class RohDriver:
     def _fence(self, node: int, used: Sequence[int]) -> Fence[Sequence[int]]:
         count = fence_count(used, self.limits.read)
         address = FIRST if count in TOLD else ELSEWHERE
-        return Fence(self.wire, node, address, count, list, refusable=not used)
+        return Fence(self.timing, node, address, count, list, refusable=not used)
 
     def _kept(self, hand: Hand) -> Plan[bool]:
         """Whether the enabled fingers' registers still hold what we left there. A device failure is a hand that initialises."""
@@ -239,11 +239,11 @@ class RohDriver:
         finger.target(hand.map, start)
         finger.wanted_settings(hand.map, start)
 
-    def pace(self, goal: ServoGoal) -> float | None:
+    def host_speed(self, goal: ServoGoal) -> float | None:
         """The hand keeps the speed that stands in its register."""
         return None
 
-    def plan(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
+    def plan_goals(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
         """Every write is acknowledged with its address and number, asked for or not."""
         parts = goals.by_hand(self.hands, [(self.fingers[goal.servo], goal) for goal in goals_])
         return goals.turns(parts, together=together)

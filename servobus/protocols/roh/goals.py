@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
-from servobus.protocols.base import GoalTurn, Plan, ask
+from servobus.protocols.base import GoalPlan, Plan, ask
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import Hand
 from servobus.protocols.roh.spans import write_spans
@@ -71,11 +71,11 @@ class HandGoals:
         return ((finger.name, finger) for finger, _ in self.goals)
 
 
-def turns(parts: Sequence[HandGoals], *, together: bool) -> list[GoalTurn]:
+def turns(parts: Sequence[HandGoals], *, together: bool) -> list[GoalPlan]:
     """One turn for each hand, or one for all."""
     if together and len(parts) > 1:
-        return [GoalTurn(tuple(name for part in parts for name in part.names), _one_after_the_other(parts), len(parts))]
-    return [GoalTurn(part.names, part.send()) for part in parts]
+        return [GoalPlan(tuple(name for part in parts for name in part.names), _one_after_the_other(parts), len(parts))]
+    return [GoalPlan(part.names, part.send()) for part in parts]
 
 
 def _one_after_the_other(parts: Sequence[HandGoals]) -> Plan[Results]:

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Plan, Request, ask
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, ReadHolding, Wire, WriteMultiple, WriteSingle
+from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, FrameTiming, ReadHolding, WriteMultiple, WriteSingle
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.model_loading import NEWEST
@@ -42,12 +42,18 @@ class Hand:
     """One unit. `limits` are the line's, shared with all hands."""
 
     def __init__(
-        self, unit: int, fingers: Sequence[Finger], pinned: str, models: Mapping[str, RohModel], wire: Wire, limits: Limits
+        self,
+        unit: int,
+        fingers: Sequence[Finger],
+        pinned: str,
+        models: Mapping[str, RohModel],
+        timing: FrameTiming,
+        limits: Limits,
     ) -> None:
         self.unit = unit
         self.fingers = fingers
         self.pinned = pinned
-        self.wire = wire
+        self.timing = timing
         self.limits = limits
         self.single_writes = False
         """0x06 for single registers."""
@@ -65,7 +71,7 @@ class Hand:
     # Which map
 
     def probe(self) -> ReadHolding[Sequence[int]]:
-        return ReadHolding(self.wire, self.unit, FIRST, SEEN, list)
+        return ReadHolding(self.timing, self.unit, FIRST, SEEN, list)
 
     def attach(self) -> Plan[None]:
         """Ask for the map where it is not known. Raises DeviceError where nothing may be written."""
@@ -120,12 +126,12 @@ class Hand:
     # Reading and writing
 
     def read(self, span: Span, make: Callable[[Sequence[int]], R]) -> ReadHolding[R]:
-        return ReadHolding(self.wire, self.unit, span.start, span.count, make)
+        return ReadHolding(self.timing, self.unit, span.start, span.count, make)
 
     def write(self, address: int, words: Sequence[int], *, repeat: bool = True) -> Request[None]:
         if self.single_writes and len(words) == 1:
-            return WriteSingle(self.wire, self.unit, address, words[0], repeat=repeat)
-        return WriteMultiple(self.wire, self.unit, address, words, repeat=repeat)
+            return WriteSingle(self.timing, self.unit, address, words[0], repeat=repeat)
+        return WriteMultiple(self.timing, self.unit, address, words, repeat=repeat)
 
     def trusted(self, model: RohModel, make: Callable[[Sequence[int]], R]) -> Callable[[Sequence[int]], R]:
         """Of an answer to a read by this map, if it turned out to be the right one. Else DeviceError."""

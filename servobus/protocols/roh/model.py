@@ -20,7 +20,7 @@ FULL = 0xFFFF
 
 Channel = Literal["thumb_bend", "index", "middle", "ring", "little", "thumb_rotation"]
 CHANNELS: tuple[Channel, ...] = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
-"""Place in this row = number on the wire."""
+"""Place in this row = number on the timing."""
 
 PARTS = (
     "fw_version", "sub_exception", "node_id", "status", "current_limit", "current", "speed", "pos_target", "pos", "angle_target",

@@ -12,7 +12,7 @@ from servobus.protocols.roh.options import MAPS, RohBus, RohServo
 
 FILES = ModelFiles(RohModel, Path(__file__).parent / "models")
 NEWEST = MAPS[-1]
-"""Stands for a map that is not known yet where nothing is sent: config checks, wire load, simulated hands."""
+"""Stands for a map that is not known yet where nothing is sent: config checks, timing load, simulated hands."""
 
 
 def packaged_models() -> Mapping[str, RohModel]:

@@ -100,7 +100,7 @@ def _tell(hand: Hand, targets: Targets) -> Plan[dict[str, StopReport]]:
         for finger in run:
             finger.may_hold(raws[finger])
         for _ in range(TIMES):
-            yield from ask(Tell(hand.wire, hand.unit, span.start, values))
+            yield from ask(Tell(hand.timing, hand.unit, span.start, values))
     return {
         finger.name: StopReport(
             "hold",

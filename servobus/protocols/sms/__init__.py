@@ -1,6 +1,6 @@
 """FEETECH SMS 1.0 and its relatives (STS, SCS): the seed's instruction packets on RS485 or TTL."""
 
-from servobus.protocols.definition import ProtocolEntry
+from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.sms.codec import MAX_ID, SmsCodec, node_of, rename
 from servobus.protocols.sms.driver import SmsDriver
 from servobus.protocols.sms.model_loading import load_models
@@ -13,7 +13,7 @@ def codec(options: SmsBus | None) -> SmsCodec:
     return SmsCodec()
 
 
-ENTRY = ProtocolEntry(
+DEFINITION = ProtocolDefinition(
     options=SmsBus,
     models=load_models,
     codec=codec,

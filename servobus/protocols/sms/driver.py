@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError, UnknownName
-from servobus.protocols.base import GoalTurn, PlainDriver, Plan, Poll, Request, ask
+from servobus.protocols.base import GoalPlan, PlainDriver, Plan, Poll, Request, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
@@ -62,7 +62,7 @@ class SmsDriver(PlainDriver):
         free = (node for node in range(MAX_ID, -1, -1) if node not in self.by_node)
         return Ping(next(free))
 
-    def recover(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         used = list(avoid)
         for attempt in range(FENCE_TRIES):
             size = fence_size(used)
@@ -279,11 +279,11 @@ class SmsDriver(PlainDriver):
         start = goal if goal.start is not None else ServoGoal(goal.servo, goal.goal, goal.goal.value)
         self.servos[goal.servo].goal_span(start)
 
-    def pace(self, goal: ServoGoal) -> float | None:
+    def host_speed(self, goal: ServoGoal) -> float | None:
         """The servo keeps the speed that stands beside its goal."""
         return None
 
-    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalTurn]:
+    def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
         return self._writer.plan([(self.servos[goal.servo], goal) for goal in goals], together=together, confirm=confirm)
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:

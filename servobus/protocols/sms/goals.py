@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from servobus.errors import ActionWithheld, NotSupported, ReplyTimeout, ServobusError
-from servobus.protocols.base import GoalTurn, Plan, ask
+from servobus.protocols.base import GoalPlan, Plan, ask
 from servobus.protocols.sms.codec import OVERHEAD
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Action, Read, RegWrite, SyncWrite, Write, sync_write_size
@@ -43,7 +43,7 @@ class GoalWriter:
     options: SmsBus
     maybe_armed: dict[int, FittedServo] = field(default_factory=dict)
 
-    def plan(self, goals: Sequence[tuple[FittedServo, ServoGoal]], *, together: bool, confirm: bool) -> list[GoalTurn]:
+    def plan(self, goals: Sequence[tuple[FittedServo, ServoGoal]], *, together: bool, confirm: bool) -> list[GoalPlan]:
         parts = [Part(servo, *servo.goal_span(goal), servo.changed_extras(goal)) for servo, goal in goals]
         if len(parts) == 1 and (self.acknowledged or not confirm):
             return [self._turn(parts, self._write(parts[0]))]
@@ -71,8 +71,8 @@ class GoalWriter:
             yield list(parts[start : start + count])
 
     @staticmethod
-    def _turn(parts: Sequence[Part], plan: Plan[Results], frames: int = 1) -> GoalTurn:
-        return GoalTurn(tuple(part.servo.name for part in parts), plan, frames)
+    def _turn(parts: Sequence[Part], plan: Plan[Results], frames: int = 1) -> GoalPlan:
+        return GoalPlan(tuple(part.servo.name for part in parts), plan, frames)
 
     def _write(self, part: Part) -> Plan[Results]:
         yield from ask(Write(part.servo.node, part.address, part.data, answered=self.acknowledged))

@@ -1,4 +1,4 @@
-"""KST servos on the engine: a simulated line with real wire time, in virtual time."""
+"""KST servos on the engine: a simulated line with real timing time, in virtual time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from servobus.errors import ReplyTimeout
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
-from servobus.protocols.kst import ENTRY
+from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.commissioning import Commissioning
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.simulated.device import KstDevice
@@ -44,15 +44,17 @@ async def running(
     """The service of a bus of two servos, its devices, and the events it told."""
     loop = asyncio.get_running_loop()
     options = bus_options({"pan": {"id": 1}, "tilt": {"id": 2}}, poll={"feedback": 50, "health": 5}, **keys)
-    models = ENTRY.models(options, Path())
+    models = DEFINITION.models(options, Path())
     events: list[str] = []
-    servos = [device for device in ENTRY.devices(options, models) if isinstance(device, KstDevice)]
-    line = SimLine(servos, ENTRY.device_codec(options), loop, baudrate=options.baudrate)
+    servos = [device for device in DEFINITION.devices(options, models) if isinstance(device, KstDevice)]
+    line = SimLine(servos, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
     with closing(line):
-        far = line if faults is None else FaultyEnd(line, faults, loop, rename=ENTRY.rename, node_of=ENTRY.node_of)
+        far = line if faults is None else FaultyEnd(line, faults, loop, rename=DEFINITION.rename, node_of=DEFINITION.node_of)
         link = MemoryLink(far, LineTraits(options.baudrate, paced=True, can_change_baud=True))
-        driver = ENTRY.driver(options, models)
-        bus = BusService("gimbal", options, driver, ENTRY.codec(options), link.traits, lambda name, **fields: events.append(name))
+        driver = DEFINITION.driver(options, models)
+        bus = BusService(
+            "gimbal", options, driver, DEFINITION.codec(options), link.traits, lambda name, **fields: events.append(name)
+        )
         await link.connect(bus.master)
         await bus.start()
         try:

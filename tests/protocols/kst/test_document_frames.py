@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from servobus.protocols.base import Request, run_plan
-from servobus.protocols.kst import ENTRY
+from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.codec import BAUD_TABLE, FACTORY_ID, Command, decode_position, encode, encode_position, version_text
-from servobus.protocols.kst.requests import Confirmed, Fence, Read, Save, Tell, Wire
+from servobus.protocols.kst.requests import Confirmed, Fence, FrameTiming, Read, Save, Tell
 from tests.protocols.kst.bench import Bench, device_of, frame_of, tell
 
 # Section 3.5: position, High, Low.
@@ -36,11 +36,11 @@ def test_the_baud_table(code: int, rate: int) -> None:
 
 
 def test_what_a_new_servo_is_set_to() -> None:
-    assert (FACTORY_ID, ENTRY.baudrates[0]) == (0x25, 512_000)
-    assert sorted(ENTRY.baudrates) == sorted(BAUD_TABLE.values())
+    assert (FACTORY_ID, DEFINITION.baudrates[0]) == (0x25, 512_000)
+    assert sorted(DEFINITION.baudrates) == sorted(BAUD_TABLE.values())
 
 
-WIRE = Wire()
+WIRE = FrameTiming()
 # Name of the request, its frame as sections 2 and 3 lay it out (sums computed), the reply's frame, the value.
 LAYOUTS: list[tuple[Request[Any], str, str, Any]] = [
     (

@@ -35,12 +35,12 @@ def test_it_is_a_driver() -> None:
 def test_the_host_keeps_the_speed(keys: dict[str, Any], fields: dict[str, Any], speed: float | None) -> None:
     driver = Bench({"pan": {"id": 1, **keys}}).driver
     wanted = Goal(**{"kind": "position", "value": 30.0, **fields})
-    assert driver.pace(ServoGoal("pan", wanted, start=10.0)) == speed
+    assert driver.host_speed(ServoGoal("pan", wanted, start=10.0)) == speed
 
 
 def test_nobody_is_led_from_an_unknown_place() -> None:
     with pytest.raises(LimitError, match="its position is not known"):
-        Bench().driver.pace(ServoGoal("pan", Goal("position", 1.0)))
+        Bench().driver.host_speed(ServoGoal("pan", Goal("position", 1.0)))
 
 
 # Who is there
@@ -136,7 +136,7 @@ def test_reading_may_bring_the_goal() -> None:
     bench = Bench()
     bench.devices[0].reads_goal = True
     bench.run(bench.driver.enable("pan"))
-    for turn in bench.driver.plan([goal("pan", 45)], together=False, confirm=False):
+    for turn in bench.driver.plan_goals([goal("pan", 45)], together=False, confirm=False):
         bench.run(turn.plan)
     assert bench.exchange(bench.driver.read_register("pan", "position")) == 45
 
@@ -209,7 +209,7 @@ def test_goals_the_wire_can_carry_pass() -> None:
 
 def test_a_plan_outside_the_range_is_refused_too() -> None:
     with pytest.raises(LimitError):
-        Bench().driver.plan([goal("pan", 90.1)], together=False, confirm=False)
+        Bench().driver.plan_goals([goal("pan", 90.1)], together=False, confirm=False)
 
 
 def test_a_lenient_and_other_version_line_works_end_to_end() -> None:

@@ -21,7 +21,7 @@ def position_frame(node: int, steps: int) -> bytes:
 def move(bench: Bench, *, together: bool = False, confirm: bool = False, **goals: float) -> dict[str, Any]:
     wanted = [goal(name, value) for name, value in goals.items()]
     results: dict[str, Any] = {}
-    for turn in bench.driver.plan(wanted, together=together, confirm=confirm):
+    for turn in bench.driver.plan_goals(wanted, together=together, confirm=confirm):
         results |= bench.run(turn.plan)
     return results
 
@@ -40,7 +40,7 @@ def target(servo: str, kind: str = "hold", **keys: Any) -> StopTarget:
 
 def test_each_goal_has_a_turn_of_its_own() -> None:
     bench = enabled()
-    turns = bench.driver.plan([goal("pan", 10), goal("tilt", -10.9)], together=False, confirm=False)
+    turns = bench.driver.plan_goals([goal("pan", 10), goal("tilt", -10.9)], together=False, confirm=False)
     assert [(turn.servos, turn.frames) for turn in turns] == [(("pan",), 1), (("tilt",), 1)]
     for turn in turns:
         assert set(bench.run(turn.plan).values()) == {Outcome.ACKED}
@@ -50,10 +50,10 @@ def test_each_goal_has_a_turn_of_its_own() -> None:
 @pytest.mark.parametrize("confirm", [True, False])
 def test_together_is_one_uninterrupted_plan(confirm: bool) -> None:
     bench = enabled()
-    (turn,) = bench.driver.plan([goal("pan", 10), goal("tilt", -10)], together=True, confirm=confirm)
+    (turn,) = bench.driver.plan_goals([goal("pan", 10), goal("tilt", -10)], together=True, confirm=confirm)
     assert (turn.servos, turn.frames) == (("pan", "tilt"), 2)
     assert bench.run(turn.plan) == {"pan": Outcome.ACKED, "tilt": Outcome.ACKED}
-    assert bench.driver.plan([], together=True, confirm=False) == []
+    assert bench.driver.plan_goals([], together=True, confirm=False) == []
 
 
 def test_what_one_servo_refuses_does_not_keep_the_others() -> None:
@@ -184,7 +184,7 @@ def test_a_servo_that_has_restarted_is_not_sent_back() -> None:
 
 def test_a_latched_fault_does_not_keep_a_stop_back() -> None:
     bench = enabled()
-    bench.driver.wire.aborts.faulty.add(1)
+    bench.driver.timing.aborts.faulty.add(1)
     assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed
 
 

@@ -108,7 +108,7 @@ def test_a_configured_servo_is_asked_in_short_unless_it_has_the_factory_id() -> 
 
 def test_a_learned_byte_order_is_told() -> None:
     bench = Bench()
-    bench.driver.wire.aborts.code(b"\x30\x00\x09\x06")
+    bench.driver.timing.aborts.code(b"\x30\x00\x09\x06")
     assert "low byte first" in bench.run(bench.driver.identify("pan")).notes[0]
     told = Bench(sdo_order="le")
     assert told.run(told.driver.identify("pan")).notes == ()

@@ -12,7 +12,7 @@ from servobus.errors import ConfigError
 from servobus.protocols.kst import codec
 from servobus.protocols.kst.codec import BAUD_TABLE, encode
 from servobus.protocols.kst.model_loading import FILES, load_models, packaged_model
-from servobus.protocols.kst.requests import TURNAROUND, Wire
+from servobus.protocols.kst.requests import TURNAROUND, FrameTiming
 from tests.protocols.kst.bench import bus_options, changed_model
 
 
@@ -117,13 +117,13 @@ def test_the_codec_follows_the_options() -> None:
 
 
 def test_what_requests_take_from_the_options() -> None:
-    wire = Wire.of(
+    timing = FrameTiming.of(
         bus_options(baudrate=9600, min_gap_us=250, save_settle_ms=50, echo_check="off", sdo_order="le", version_byte=1)
     )
-    assert (wire.gap, wire.settle, wire.strict_echo, wire.version) == (250e-6, 0.05, False, 1)
-    assert wire.guard == 14 * 10 / 9600 + TURNAROUND
-    assert wire.aborts.learned == "le"
-    assert Wire.of(bus_options()).guard == Wire().guard
+    assert (timing.gap, timing.settle, timing.strict_echo, timing.version) == (250e-6, 0.05, False, 1)
+    assert timing.guard == 14 * 10 / 9600 + TURNAROUND
+    assert timing.aborts.learned == "le"
+    assert FrameTiming.of(bus_options()).guard == FrameTiming().guard
 
 
 # Models

@@ -10,10 +10,10 @@ from servobus.errors import DeviceError, EchoMismatch, NotSupported
 from servobus.protocols.base import Request
 from servobus.protocols.kst.aborts import AbortReader, OutOfRange
 from servobus.protocols.kst.codec import Command, decode_position, encode, encode_position
-from servobus.protocols.kst.requests import Broadcast, Confirmed, Fence, Read, Save, Tell, Wire
+from servobus.protocols.kst.requests import Broadcast, Confirmed, Fence, FrameTiming, Read, Save, Tell
 from tests.protocols.kst.bench import bus_options, frame_of
 
-WIRE = Wire()
+WIRE = FrameTiming()
 
 
 def test_only_the_reply_and_the_refusal_of_its_own_command_answer() -> None:
@@ -46,7 +46,7 @@ def test_another_value_than_the_one_sent_is_a_mismatch() -> None:
     with pytest.raises(EchoMismatch, match="set position: 94 ff was confirmed, 93 ff was sent") as caught:
         request.parse([frame_of(encode(7, 0x49, encode_position(-108)))])
     assert caught.value.raw == encode(7, 0x49, encode_position(-108))
-    lenient = Confirmed(Wire(strict_echo=False), 7, Command.SET_POSITION, encode_position(-109))
+    lenient = Confirmed(FrameTiming(strict_echo=False), 7, Command.SET_POSITION, encode_position(-109))
     lenient.parse([frame_of(encode(7, 0x49, encode_position(-108)))])
 
 
@@ -93,15 +93,15 @@ def test_a_fence_is_passed_by_any_answer_to_it_but_another_id() -> None:
 
 def test_silence_after_what_is_not_answered() -> None:
     """K2, K4, K7."""
-    wire = Wire(gap=0.001, guard=0.004, settle=0.3)
-    assert Read(wire, 1, Command.READ_ID, bytes).quiet_after == 0.001
-    assert Tell(wire, 1, Command.SET_POSITION, bytes(2)).quiet_after == 0.004
-    assert Tell(wire, 1, Command.SAVE, b"save").quiet_after == 0.3
-    assert Tell(Wire(guard=0.004, settle=0), 1, Command.SAVE, b"save").quiet_after == 0.004
-    assert (Save(wire, 1).service_time, Save(wire, 1).quiet_after) == (0.3, 0.3)
-    assert Tell(wire, 1, Command.SAVE, b"save").parse(()) is None  # type: ignore[func-returns-value]
+    timing = FrameTiming(gap=0.001, guard=0.004, settle=0.3)
+    assert Read(timing, 1, Command.READ_ID, bytes).quiet_after == 0.001
+    assert Tell(timing, 1, Command.SET_POSITION, bytes(2)).quiet_after == 0.004
+    assert Tell(timing, 1, Command.SAVE, b"save").quiet_after == 0.3
+    assert Tell(FrameTiming(guard=0.004, settle=0), 1, Command.SAVE, b"save").quiet_after == 0.004
+    assert (Save(timing, 1).service_time, Save(timing, 1).quiet_after) == (0.3, 0.3)
+    assert Tell(timing, 1, Command.SAVE, b"save").parse(()) is None  # type: ignore[func-returns-value]
     with pytest.raises(DeviceError):
-        Save(wire, 1).parse([frame_of(encode(1, 0xCF, b"\x08\x00\x00\x20"))])
+        Save(timing, 1).parse([frame_of(encode(1, 0xCF, b"\x08\x00\x00\x20"))])
 
 
 def test_set_position_may_be_said_to_all_and_nobody_answers() -> None:
@@ -120,7 +120,7 @@ def test_nothing_else_is_said_to_all(command: Command) -> None:
 
 def test_a_lone_servo_answers_from_its_own_address() -> None:
     options = bus_options({}, broadcast_allow=[0x18], broadcast_reply="expect_one")
-    request = Broadcast(Wire(AbortReader()), options, Command.READ_ID)
+    request = Broadcast(FrameTiming(AbortReader()), options, Command.READ_ID)
     reply = frame_of(encode(9, 0x58, b"\x09"))
     assert (request.replies, request.nodes) == (1, ())
     assert request.answers(reply)

@@ -10,17 +10,17 @@ from servobus.errors import DeviceError
 from servobus.protocols.modbus.codec import MAX_READ, MAX_WRITE, Frame, ModbusCodec, encode, pack
 from servobus.protocols.modbus.requests import (
     EXCEPTIONS,
-    LEAST_GAP,
+    MIN_GAP,
     Fence,
+    FrameTiming,
     Probe,
     ReadHolding,
     Tell,
-    Wire,
     WriteMultiple,
     WriteSingle,
 )
 
-WIRE = Wire()
+WIRE = FrameTiming()
 
 
 def frame(text: str | bytes) -> Frame:
@@ -169,22 +169,22 @@ def test_a_fence_takes_a_refusal_only_when_no_other_read_can_have_it(refusable: 
 
 
 def test_frames_are_apart() -> None:
-    assert read(1, 1).quiet_after == LEAST_GAP
-    assert Wire.at(115_200).gap == Wire.at(22_000).gap == LEAST_GAP
-    assert Wire.at(19_200).gap == pytest.approx(3.5 * 11 / 19_200)
-    assert WriteMultiple(Wire.at(9_600), 2, 1, [1]).quiet_after == pytest.approx(3.5 * 11 / 9_600)
+    assert read(1, 1).quiet_after == MIN_GAP
+    assert FrameTiming.at(115_200).gap == FrameTiming.at(22_000).gap == MIN_GAP
+    assert FrameTiming.at(19_200).gap == pytest.approx(3.5 * 11 / 19_200)
+    assert WriteMultiple(FrameTiming.at(9_600), 2, 1, [1]).quiet_after == pytest.approx(3.5 * 11 / 9_600)
 
 
 def test_a_broadcast_is_not_answered_and_followed_by_a_longer_silence() -> None:
-    wire = Wire.at(115_200, 0.2)
-    for asked in (WriteSingle(wire, 0, 1010, 500), WriteMultiple(wire, 0, 1010, [500])):
+    timing = FrameTiming.at(115_200, 0.2)
+    for asked in (WriteSingle(timing, 0, 1010, 500), WriteMultiple(timing, 0, 1010, [500])):
         assert (asked.replies, asked.nodes) == (0, ())
-        assert asked.quiet_after == pytest.approx(LEAST_GAP + 0.2)
+        assert asked.quiet_after == pytest.approx(MIN_GAP + 0.2)
         asked.parse(())
 
 
 def test_what_is_told_leaves_time_for_an_answer_nobody_waits_for() -> None:
-    told = Tell(Wire.at(115_200), 2, 1135, [1])
+    told = Tell(FrameTiming.at(115_200), 2, 1135, [1])
     assert told.frame == WriteMultiple(WIRE, 2, 1135, [1]).frame
     assert (told.replies, told.nodes) == (0, ())
     assert 0.005 < told.quiet_after < 0.01

@@ -116,7 +116,7 @@ class Bench:
 
     def move(self, *goals: ServoGoal, together: bool = False) -> dict[str, Outcome | Exception]:
         results: dict[str, Outcome | Exception] = {}
-        for turn in self.driver.plan(goals, together=together, confirm=False):
+        for turn in self.driver.plan_goals(goals, together=together, confirm=False):
             results |= self.run(turn.plan)
         return results
 

@@ -1,4 +1,4 @@
-"""Hands on the engine: a simulated line with real wire time, in virtual time."""
+"""Hands on the engine: a simulated line with real timing time, in virtual time."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from servobus.bus.bandwidth import wire_load
+from servobus.bus.bandwidth import line_bandwidth
 from servobus.bus.service import BusService
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.options import FaultOptions
-from servobus.protocols.roh import ENTRY
+from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
 from servobus.simulation.line import SimLine
 from servobus.values import Goal, Outcome
@@ -47,16 +47,18 @@ async def running(
     """The service of a line, its hands, and the events it told."""
     loop = asyncio.get_running_loop()
     options = bus_options(servos, poll={"feedback": 20, "health": 5}, **keys)
-    models = ENTRY.models(options, Path())
+    models = DEFINITION.models(options, Path())
     events: list[str] = []
-    hands = [device for device in ENTRY.devices(options, models) if isinstance(device, RohDevice)]
-    line = SimLine(hands, ENTRY.device_codec(options), loop, baudrate=options.baudrate)
+    hands = [device for device in DEFINITION.devices(options, models) if isinstance(device, RohDevice)]
+    line = SimLine(hands, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
     with closing(line):
-        far = line if faults is None else FaultyEnd(line, faults, loop, rename=ENTRY.rename, node_of=ENTRY.node_of)
+        far = line if faults is None else FaultyEnd(line, faults, loop, rename=DEFINITION.rename, node_of=DEFINITION.node_of)
         paced = faults is None or not faults.echo
         link = MemoryLink(far, LineTraits(options.baudrate, paced=paced, can_change_baud=True))
-        driver = ENTRY.driver(options, models)
-        bus = BusService("hand", options, driver, ENTRY.codec(options), link.traits, lambda name, **fields: events.append(name))
+        driver = DEFINITION.driver(options, models)
+        bus = BusService(
+            "hand", options, driver, DEFINITION.codec(options), link.traits, lambda name, **fields: events.append(name)
+        )
         await link.connect(bus.master)
         await bus.start()
         try:
@@ -197,8 +199,8 @@ async def test_silence_stands_between_frames() -> None:
 
 def test_the_load_of_a_line_is_told_before_it_is_opened() -> None:
     options = bus_options(HAND, poll={"feedback": 20}, goal_rate=20)
-    driver = ENTRY.driver(options, ENTRY.models(options, Path()))
-    load = wire_load(options, driver, LineTraits(options.baudrate))
+    driver = DEFINITION.driver(options, DEFINITION.models(options, Path()))
+    load = line_bandwidth(options, driver, LineTraits(options.baudrate))
     # A write of six and its answer are 29 bytes, a read of six 25; each has its silence and the usual turnaround.
     assert load.shares["goals"] == pytest.approx(100 * 20 * (29 * 10 / 115_200 + 0.00175 + 0.0005))
     assert load.shares["feedback"] == pytest.approx(100 * 20 * (25 * 10 / 115_200 + 0.00175 + 0.0005))

@@ -52,7 +52,7 @@ def test_degrees_and_percent_have_registers_of_their_own() -> None:
     assert bench.frames() == ["unit 2 WRITE 1135 = 32768", "unit 2 WRITE 1137 = 32768", "unit 2 WRITE 1156 = 15050"]
     assert bench.after(3).read("index", "position") == pytest.approx(100 * (178.37 - 150.5) / 78.15, abs=0.01)
     assert bench.read("index", "angle") == pytest.approx(150.5, abs=0.02)
-    assert bench.run(bench.driver.recover(2, [], True)), "an angle may read back a little otherwise"
+    assert bench.run(bench.driver.fence(2, [], True)), "an angle may read back a little otherwise"
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -61,7 +61,7 @@ def test_a_goal_reaches_the_target_register_of_each_map_and_no_other(together: b
     bench = three_hands().enable()
     for number, channel in enumerate(CHANNELS):
         names = [f"{name}_{channel}" for name in TARGETS]
-        turns = bench.driver.plan([goal(name, 100) for name in names], together=together, confirm=False)
+        turns = bench.driver.plan_goals([goal(name, 100) for name in names], together=together, confirm=False)
         assert [turn.servos for turn in turns] == ([tuple(names)] if together else [(name,) for name in names])
         for turn in turns:
             assert set(bench.run(turn.plan).values()) == {"acked"}
@@ -226,7 +226,7 @@ def test_a_read_runs_over_strangers_only_where_that_is_cheaper() -> None:
 def test_a_preview_needs_no_hand() -> None:
     bench = Bench()
     said: list[str] = []
-    for turn in bench.driver.plan(all_fingers(50), together=False, confirm=False):
+    for turn in bench.driver.plan_goals(all_fingers(50), together=False, confirm=False):
         run_plan(turn.plan, lambda request: said.append(type(request).__name__))
     assert said == ["ReadHolding", "WriteMultiple", "WriteMultiple"]
     reports = run_plan(bench.driver.stop([StopTarget("index", "hold", True, 0.0)]), lambda request: 0)

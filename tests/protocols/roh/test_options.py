@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from servobus.errors import ConfigError, LimitError, UnknownName
 from servobus.protocols.base import LineTraits
-from servobus.protocols.roh import ENTRY
+from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.model import CHANNELS, RohModel
 from servobus.protocols.roh.model_loading import FILES, load_models, packaged_models
 from tests.protocols.roh.bench import HAND, bus_options
@@ -91,9 +91,9 @@ def test_limits_in_degrees_are_what_the_finger_reaches(keys: dict[str, Any], fin
 
 
 def test_scan() -> None:
-    assert ENTRY.baudrates[0] == 115_200
-    assert {9_600, 460_800} <= set(ENTRY.baudrates)
-    assert (ENTRY.scan_ids[0], ENTRY.scan_ids[-1]) == (1, 247)
+    assert DEFINITION.baudrates[0] == 115_200
+    assert {9_600, 460_800} <= set(DEFINITION.baudrates)
+    assert (DEFINITION.scan_ids[0], DEFINITION.scan_ids[-1]) == (1, 247)
 
 
 # Maps

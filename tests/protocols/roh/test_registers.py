@@ -48,14 +48,14 @@ def test_feedback_is_one_read_and_health_the_fewest(name: str) -> None:
 
 def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
     bench = Bench()
-    bench.driver.carries(LineTraits(max_read=12, max_write=10))
+    bench.driver.use_traits(LineTraits(max_read=12, max_write=10))
     bench.enable()
     reads = [poll.request([2]) for poll in bench.driver.polls({"feedback": 50, "health": 5})]
     assert [request.frame[5] for request in reads if request] == [6, 6, 6]
     assert bench.exchange(bench.driver.read_state("index"))["index"]["position"] == 0
     for servo in CHANNELS:
         bench.run(bench.driver.enable(servo))
-    assert bench.run(bench.driver.recover(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], True))
     assert max(request.frame[5] for request in bench.said if request.frame[1] == READ) == 12
     with pytest.raises(NotSupported, match=r"18 words, the line carries 12 at once: read it in parts, 2000:12"):
         bench.driver.read_register("thumb_bend", "force_ex")

@@ -64,7 +64,7 @@ class Bench:
         """Plan and run; the results of all turns."""
         asked = [ServoGoal(name, goal if isinstance(goal, Goal) else Goal("position", goal), 0.0) for name, goal in goals.items()]
         results: Results = {}
-        for turn in self.driver.plan(asked, together=together, confirm=confirm):
+        for turn in self.driver.plan_goals(asked, together=together, confirm=confirm):
             results.update(self.run(turn.plan))
         return results
 

@@ -92,7 +92,7 @@ def test_an_scs_cannot_accelerate() -> None:
 def test_a_duration_needs_a_start() -> None:
     bench = Bench()
     with pytest.raises(LimitError, match="read the servo first"):
-        bench.driver.plan([ServoGoal("a", Goal("position", 1, duration=1))], together=False, confirm=False)
+        bench.driver.plan_goals([ServoGoal("a", Goal("position", 1, duration=1))], together=False, confirm=False)
 
 
 def test_a_model_without_a_flag_cannot_confirm_without_acknowledgements() -> None:

@@ -90,7 +90,7 @@ def test_never_below_one_servo() -> None:
 def test_together_beyond_one_frame_is_reg_write_and_action() -> None:
     bench = Bench(dict(list(MANY.items())[:18]))
     bench.enable()
-    turns = bench.driver.plan(
+    turns = bench.driver.plan_goals(
         [ServoGoal(name, Goal("position", 1.0)) for name in bench.driver.nodes], together=True, confirm=False
     )
     assert [(len(turn.servos), turn.frames) for turn in turns] == [(18, 19)]

@@ -18,7 +18,7 @@ JOINTS = 6
 VERSION = {"build_time": "2024/01/01 00:00:00", "commit_id": "0000000", "version": "V1.0.0"}
 
 
-class SimArm:
+class SimulatedArm:
     """One arm of generation 2, 3 or 4."""
 
     def __init__(self, exchange: Exchange, generation: int = 3) -> None:
@@ -167,18 +167,18 @@ PORTRAIT: dict[str, Message] = {
 """What a client asks an arm before it believes that it is one."""
 
 VERBS_3: dict[str, Callable[..., Message]] = {
-    "set_tool_voltage": SimArm.set_voltage,
-    "set_modbus_mode": SimArm.set_mode,
-    "close_modbus_mode": SimArm.close_mode,
-    "read_holding_registers": SimArm.read_one,
-    "read_multiple_holding_registers": SimArm.read_some,
-    "write_single_register": SimArm.write_one,
-    "write_registers": SimArm.write_some,
+    "set_tool_voltage": SimulatedArm.set_voltage,
+    "set_modbus_mode": SimulatedArm.set_mode,
+    "close_modbus_mode": SimulatedArm.close_mode,
+    "read_holding_registers": SimulatedArm.read_one,
+    "read_multiple_holding_registers": SimulatedArm.read_some,
+    "write_single_register": SimulatedArm.write_one,
+    "write_registers": SimulatedArm.write_some,
 }
 VERBS_4: dict[str, Callable[..., Message]] = {
-    "set_tool_voltage": SimArm.set_voltage,
-    "set_tool_rs485_mode": SimArm.set_mode,
-    "set_controller_rs485_mode": SimArm.set_controller_mode,
-    "read_modbus_rtu_holding_registers": SimArm.read_words,
-    "write_modbus_rtu_registers": SimArm.write_words,
+    "set_tool_voltage": SimulatedArm.set_voltage,
+    "set_tool_rs485_mode": SimulatedArm.set_mode,
+    "set_controller_rs485_mode": SimulatedArm.set_controller_mode,
+    "read_modbus_rtu_holding_registers": SimulatedArm.read_words,
+    "write_modbus_rtu_registers": SimulatedArm.write_words,
 }

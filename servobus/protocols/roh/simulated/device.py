@@ -15,14 +15,14 @@ from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame,
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.model_loading import NEWEST
 from servobus.protocols.roh.options import RohBus
-from servobus.protocols.roh.simulated.hand import HandBody, Refusal
+from servobus.protocols.roh.simulated.hand import Refusal, SimulatedHand
 
 DELAY = 0.002
 """Seconds from question to answer; no document names one."""
 ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
 
 
-class RohDevice(HandBody):
+class RohDevice(SimulatedHand):
     """One hand on the line."""
 
     def __init__(self, model: RohModel, unit: int = 2, *, baudrate: int = 115_200) -> None:

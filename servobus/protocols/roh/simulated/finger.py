@@ -20,7 +20,7 @@ GRIP = 10
 
 
 @dataclass(slots=True)
-class Digit:
+class SimulatedFinger:
     """One finger, in logical positions. `obstacle` may be set at any time."""
 
     position: float = 0.0

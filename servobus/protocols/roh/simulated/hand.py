@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 
 from servobus.protocols.roh.model import CHANNELS, FULL, RohModel, RohRegister
-from servobus.protocols.roh.simulated.finger import Digit
+from servobus.protocols.roh.simulated.finger import SimulatedFinger
 
 SELF_TEST = 0.5
 """Seconds of the self-test at power-on."""
@@ -30,7 +30,7 @@ class Refusal(Exception):
         self.sub = sub
 
 
-class HandBody:
+class SimulatedHand:
     """Registers and fingers of one hand."""
 
     def __init__(self, model: RohModel, unit: int) -> None:
@@ -47,7 +47,7 @@ class HandBody:
         """Times the button confirms until the calibration is done."""
         self.state = "work"
         """Or wait (for start_init), init, calibration, update (of the firmware)."""
-        self.digits = [Digit(current_limit=model.default_current) for _ in CHANNELS]
+        self.digits = [SimulatedFinger(current_limit=model.default_current) for _ in CHANNELS]
         self.beeps: list[int] = []
         """Milliseconds of each beep."""
         self.written: list[tuple[int, int]] = []
@@ -75,7 +75,7 @@ class HandBody:
             if register.memory == "ram":
                 self._memory[address] = register.default or 0
         for digit, number in zip(self.digits, range(len(self.digits)), strict=True):
-            self.digits[number] = Digit(digit.position, round(digit.position), current_limit=self.model.default_current)
+            self.digits[number] = SimulatedFinger(digit.position, round(digit.position), current_limit=self.model.default_current)
         self.state = "wait"
         if self.get("self_test"):
             self._initialise(self._awake)
@@ -204,7 +204,7 @@ class HandBody:
             digit.force = 0
 
 
-LIVE: dict[str, Callable[[HandBody, int], int]] = {
+LIVE: dict[str, Callable[[SimulatedHand, int], int]] = {
     "pos": lambda hand, channel: round(hand.digits[channel].position),
     "angle": lambda hand, channel: hand._angle(channel, hand.digits[channel].position),
     "pos_target": lambda hand, channel: hand.digits[channel].target,
@@ -212,21 +212,21 @@ LIVE: dict[str, Callable[[HandBody, int], int]] = {
     "current": lambda hand, channel: hand.digits[channel].current,
     "force": lambda hand, channel: hand.digits[channel].force,
 }
-ACTS: dict[str, Callable[[HandBody, int, int], None]] = {
-    "pos_target": HandBody._aim,
-    "angle_target": HandBody._aim_angle,
-    "speed": HandBody._set_speed,
-    "current_limit": HandBody._limit_current,
-    "force_limit": HandBody._limit_force,
-    "force_target": HandBody._aim_force,
-    "stop_after_period": HandBody._stop_after,
-    "beep_period": HandBody._beep,
-    "reset": HandBody._restart,
-    "node_id": HandBody._move_to_unit,
-    "recalibrate": HandBody._recalibrate,
-    "button_press_cnt": HandBody._press,
-    "start_init": HandBody._start_init,
-    "reset_force": HandBody._zero_force,
+ACTS: dict[str, Callable[[SimulatedHand, int, int], None]] = {
+    "pos_target": SimulatedHand._aim,
+    "angle_target": SimulatedHand._aim_angle,
+    "speed": SimulatedHand._set_speed,
+    "current_limit": SimulatedHand._limit_current,
+    "force_limit": SimulatedHand._limit_force,
+    "force_target": SimulatedHand._aim_force,
+    "stop_after_period": SimulatedHand._stop_after,
+    "beep_period": SimulatedHand._beep,
+    "reset": SimulatedHand._restart,
+    "node_id": SimulatedHand._move_to_unit,
+    "recalibrate": SimulatedHand._recalibrate,
+    "button_press_cnt": SimulatedHand._press,
+    "start_init": SimulatedHand._start_init,
+    "reset_force": SimulatedHand._zero_force,
 }
 
 

@@ -16,7 +16,7 @@ from servobus.protocols.base import DeviceReply
 from servobus.protocols.sms.codec import ANSWERED_BROADCASTS, BROADCAST_ID, WRITES, Instruction, Packet, encode
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
-from servobus.protocols.sms.simulated.servo import ServoBody
+from servobus.protocols.sms.simulated.servo import SimulatedServo
 
 SHORTEST_DELAY = 50
 """A return delay below this, but not 0, acts as this (units of 2 us; feetech.md, section 2)."""
@@ -28,7 +28,7 @@ Answer: TypeAlias = tuple[int, bytes] | None
 """Place among the answers, and parameters; None: silence."""
 
 
-class SmsDevice(ServoBody):
+class SmsDevice(SimulatedServo):
     """One servo on the line. `dead` and `extra_delay` may be set at any time."""
 
     def __init__(

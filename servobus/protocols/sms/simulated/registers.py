@@ -21,7 +21,7 @@ BASICS = {
 """The same in every table; a model file that leaves one out has it still."""
 
 
-class MemoryTable:
+class RegisterTable:
     """Bytes by address, words by register. What may be written from the wire is `write`; `put` is the servo's own hand."""
 
     __slots__ = ("_lock", "_number", "_order", "_stored", "_writable", "data", "registers")

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from servobus.protocols.sms.codec import MAX_ID, MAX_PARAMETERS
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.simulated.joint import Joint
-from servobus.protocols.sms.simulated.registers import SIZE, MemoryTable
+from servobus.protocols.sms.simulated.registers import SIZE, RegisterTable
 
 TORQUE_ON, CALIBRATE = 1, 128
 MIDDLE = 2048
@@ -26,7 +26,7 @@ SETTINGS = ("torque_limit", "max_torque", "min_angle_limit", "max_angle_limit", 
 """Beside goal, torque and wheel registers, these have a say in what the joint does."""
 
 
-class ServoBody:
+class SimulatedServo:
     """Registers and joint of one servo. Plain attributes may be set at any time: `faults`, `voltage`, `joint.stuck`."""
 
     def __init__(self, model: SmsModel, servo_id: int, *, baudrate: int, position: int | None, response_level: int) -> None:
@@ -36,7 +36,7 @@ class ServoBody:
         self.voltage = 12.0
         self.faults = 0
         """The health byte (feetech.md, section 6): in each answer and in register 65."""
-        self.memory = MemoryTable(model)
+        self.memory = RegisterTable(model)
         self._registers = self.memory.registers
         self._offset = 0
         start = float(model.zero if position is None else position) % model.steps_per_turn
@@ -181,10 +181,10 @@ class ServoBody:
         self._steer()
 
 
-LIVE: dict[str, Callable[[ServoBody], float]] = {
-    "present_position": ServoBody.reported,
+LIVE: dict[str, Callable[[SimulatedServo], float]] = {
+    "present_position": SimulatedServo.reported,
     "present_speed": lambda body: body.joint.velocity,
-    "present_load": ServoBody.load,
+    "present_load": SimulatedServo.load,
     "present_voltage": lambda body: body.voltage,
     "present_temperature": lambda body: body.joint.temperature,
     "servo_status": lambda body: body.faults,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from servobus.protocols.base import Device
-from servobus.protocols.kst import ENTRY
+from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.aborts import ABORTS
 from servobus.protocols.kst.codec import ASKS, FACTORY_ID, Command, encode, encode_position
 from servobus.protocols.kst.model_loading import load_models, packaged_model
@@ -151,14 +151,14 @@ def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> Non
         broadcast_reply="expect_one",
         id_effective="immediate",
     )
-    (device,) = ENTRY.devices(options, load_models(options, Path()))
+    (device,) = DEFINITION.devices(options, load_models(options, Path()))
     assert (device.node, device.baudrate) == (1, 9600)
     kst = device_of()
     assert isinstance(device, type(kst))
     assert (device.position, device.version, device.sdo_order, device.answers_save) == (120, 0xCB, "le", True)
     assert (device.answers_broadcasts, device.immediate) == (True, True)
     defaults = bus_options()
-    for servo in ENTRY.devices(defaults, load_models(defaults, Path())):
+    for servo in DEFINITION.devices(defaults, load_models(defaults, Path())):
         assert isinstance(servo, type(kst))
         assert (servo.position, servo.sdo_order, servo.answers_save, servo.answers_broadcasts, servo.immediate) == (
             0,
@@ -170,11 +170,11 @@ def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> Non
 
 
 def test_the_entry_speaks_for_the_folder() -> None:
-    assert ENTRY.scan_ids == range(1, 255)
+    assert DEFINITION.scan_ids == range(1, 255)
     frame = encode(5, 0x58, b"\5")
-    assert ENTRY.node_of(frame) == 5
-    assert ENTRY.node_of(ENTRY.rename(frame, random.Random(1))) != 5
-    for made in (ENTRY.codec(None), ENTRY.device_codec(None)):
+    assert DEFINITION.node_of(frame) == 5
+    assert DEFINITION.node_of(DEFINITION.rename(frame, random.Random(1))) != 5
+    for made in (DEFINITION.codec(None), DEFINITION.device_codec(None)):
         made.receive_data(frame)
         assert made.next_reply() == frame_of(frame)
-    assert ENTRY.driver(bus_options({}), {}).nodes == {}
+    assert DEFINITION.driver(bus_options({}), {}).nodes == {}

@@ -8,12 +8,12 @@ import pytest
 
 from servobus.protocols.modbus.codec import ModbusCodec
 from servobus.protocols.realman.codec import dialect
-from servobus.protocols.realman.simulated.arm import PORTRAIT, SimArm
+from servobus.protocols.realman.simulated.arm import PORTRAIT, SimulatedArm
 from servobus.protocols.roh.simulated.device import RohDevice
 from tests.protocols.roh.bench import hand_of
 
 
-def arm_of(generation: int = 3, hand: RohDevice | None = None) -> SimArm:
+def arm_of(generation: int = 3, hand: RohDevice | None = None) -> SimulatedArm:
     behind = hand or hand_of()
 
     def exchange(question: bytes) -> bytes | None:
@@ -24,7 +24,7 @@ def arm_of(generation: int = 3, hand: RohDevice | None = None) -> SimArm:
         replies = behind.handle(frame, 0.0)
         return replies[0].data if replies else None
 
-    arm = SimArm(exchange, generation)
+    arm = SimulatedArm(exchange, generation)
     opened = arm.handle(dialect(generation, 1).open_mode(115_200, 0.1).message)
     assert opened is not None
     assert opened["set_state"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from servobus.protocols.modbus.codec import encode, pack
-from servobus.protocols.roh.simulated.finger import Digit
+from servobus.protocols.roh.simulated.finger import SimulatedFinger
 from tests.protocols.roh.bench import hand_of, look, put, question, tell
 
 ALL = pytest.mark.parametrize("name", ["legacy", "v1", "v2"])
@@ -143,7 +143,7 @@ def test_a_gentle_finger_stops_at_its_force() -> None:
 
 
 def test_a_finger_without_speed_does_not_move() -> None:
-    digit = Digit(target=100, speed=0, obstacle=0.0)
+    digit = SimulatedFinger(target=100, speed=0, obstacle=0.0)
     digit.advance(0.1)
     assert (digit.position, digit.status) == (0, 1)
 
