@@ -284,7 +284,7 @@ class Motion:
 
     def _set_enabled(self, record: ServoRecord, enabled: bool) -> None:
         record.enabled = enabled
-        record.node.enabled = any(other.enabled for other in self._bus.on(record.node))
+        record.node.enabled = tuple(other.name for other in self._bus.on(record.node) if other.enabled)
 
     def _disabled(self, servo: str) -> ServobusError:
         return NotEnabled("the servo was disabled before this goal could leave", bus=self._bus.name, servo=servo)

@@ -53,8 +53,8 @@ class Node:
         self.configured = configured
         self.greatest_deadline = greatest_deadline
         self.condition = Condition.DOUBTFUL
-        self.enabled = False
-        """A servo of this node was enabled by us, so a restart matters."""
+        self.enabled: tuple[str, ...] = ()
+        """Its servos that we have enabled, so a restart matters."""
         self.status: int | None = None
         self.outstanding: dict[Hashable, float] = {}
         """Look of a reply that did not come -> when it was asked for, oldest first."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Generator, Hashable, Mapping, 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
-from servobus.errors import DeviceError, ServobusError
+from servobus.errors import DeviceError, NotSupported, ServobusError
 from servobus.values import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
@@ -190,84 +190,112 @@ class Commissioning(Protocol):
         once; then NotSupported, DeviceError."""
 
 
-class Driver(Protocol):
-    """A protocol's verbs on one bus: what to say for each. Sans-IO; knows its servos by name and every node by id."""
+class Addressing(ABC):
+    """Who is on the line."""
 
-    @property
-    def nodes(self) -> Mapping[str, int]:
-        """Servo name to node."""
+    nodes: Mapping[str, int]
+    """Servo name -> id of the node that carries it."""
 
-    @property
-    def commissioning(self) -> Commissioning | None:
-        """None: this protocol's servos are given ids and rates with other tools."""
-
-    def use_traits(self, traits: LineTraits) -> None:
-        """What the line carries, told before it is spoken on."""
-
-    def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError] | None:
-        """What a servo that refused can still be asked, as the error to raise instead. None: nothing."""
-
-    def step(self, servo: str) -> float:
-        """The size of one raw step in the servo's unit."""
-
+    @abstractmethod
     def ping(self, node: int) -> Request[int | None]:
-        """Is it there? Its status byte, if it has one."""
+        """Return the request whose reply shows that the node is there; its value is the status byte, if there is one."""
 
+    @abstractmethod
     def unused(self) -> Request[Any]:
-        """A question nobody answers, to hear whether the line echoes."""
+        """Return a request that no node answers: what comes back is the adapter's echo."""
 
-    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
-        """Fence: ask what cannot be mistaken for any reply in `avoid` (oldest first). False: a servo of the node lost
-        what enable() wrote, so it has restarted (asked only when `enabled`)."""
+    @abstractmethod
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
+        """Ask the node something whose reply cannot be confused with a late one.
 
+        `avoid`: the reply keys that may still be under way, oldest first. `enabled`: the servos of this node that servobus has
+        enabled. Returns False when one of those lost what `enable` wrote, so the node has restarted.
+        """
+
+    @abstractmethod
     def inspect(self, node: int) -> Plan[Identity]:
-        """Who is there, whether configured or not."""
+        """Ask a node who it is, whether it is configured or not."""
 
+    @abstractmethod
     def identify(self, servo: str) -> Plan[Identity]:
-        """Who is there, and whether it fits the config. Learns what the other verbs need to know; writes nothing."""
+        """Ask a configured servo who it is and whether it fits its options. Learns what the other verbs need; writes nothing."""
 
+
+class Reading(ABC):
+    """What servos tell."""
+
+    @abstractmethod
     def read_state(self, servo: str) -> Request[dict[str, Update]]:
-        """Everything `State` can hold, by servo name."""
+        """Return the request that brings every field of `State` the servo has, by servo name."""
 
+    @abstractmethod
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
-        """The fewest reads that keep every servo's state fresh at these rates (Hz)."""
+        """Return the fewest reads that keep every servo's state fresh at these rates (Hz)."""
 
+    @abstractmethod
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
-        """Physical value, or the integer with `raw`. Raises UnknownName, NotSupported."""
-
-    def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:
-        """Write and confirm; the value then in the register. Raises LimitError, UnknownName, NotSupported at once."""
-
-    def enable(self, servo: str) -> Plan[float | None]:
-        """Goal := present, then torque on; the present position, in the servo's unit."""
-
-    def disable(self, servo: str) -> Plan[StopReport]:
-        """Torque off, confirmed."""
-
-    def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
-        """The shortest way to stillness: first everything that can be written at once, then what needs a question."""
-
-    def check_goal(self, goal: ServoGoal) -> None:
-        """Raise LimitError or NotSupported for what the model or the wire cannot carry."""
-
-    def host_speed(self, goal: ServoGoal) -> float | None:
-        """The speed (unit/s) that the host must keep on the way to this goal; None: the servo's own, or none at all."""
-
-    def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
-        """The fewest turns that carry these goals; with `together` one turn. Raises NotSupported."""
+        """Return a read of the physical value, or of the integer with `raw`. Raises UnknownName, NotSupported."""
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
-        """The words for a health byte."""
+        """Return the names of the faults in a status byte."""
+        return ()
+
+    def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError] | None:
+        """Return a plan that asks a servo why it refused, and returns the error to raise instead. None: no question."""
+        return None
 
 
-class PlainDriver:
-    """What drivers share whose frames fit every line, and whose servos tell in their refusal all they know."""
+class Writing:
+    """Settings."""
+
+    def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:
+        """Write and confirm; the plan returns the value that is then in the register.
+
+        Raises LimitError, UnknownName, NotSupported before the first frame.
+        """
+        raise NotSupported("this protocol has no registers that can be written", servo=servo)
+
+
+class Motion(ABC):
+    """What moves servos and what stops them. A plan may be closed at any frame and must leave the servo safe."""
+
+    @abstractmethod
+    def step(self, servo: str) -> float:
+        """Return the size of one raw step in the servo's unit."""
+
+    @abstractmethod
+    def enable(self, servo: str) -> Plan[float | None]:
+        """Goal := present, then torque on, read back; returns the present position in the servo's unit."""
+
+    @abstractmethod
+    def disable(self, servo: str) -> Plan[StopReport]:
+        """Torque off, read back."""
+
+    @abstractmethod
+    def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
+        """Stop servos: first everything that can be written at once, then what needs a question."""
+
+    @abstractmethod
+    def check_goal(self, goal: ServoGoal) -> None:
+        """Raise LimitError or NotSupported for what the model or the line cannot carry."""
+
+    @abstractmethod
+    def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
+        """Return the fewest plans that carry these goals; with `together` one plan. Raises NotSupported."""
+
+    def host_speed(self, goal: ServoGoal) -> float | None:
+        """Return the speed (unit/s) that the host must keep on the way to this goal; None: the servo keeps its own."""
+        return None
+
+
+class Driver(Addressing, Reading, Writing, Motion, ABC):
+    """A protocol on one bus: which requests each verb takes. Sans-IO; knows its servos by name and every node by id."""
+
+    commissioning: Commissioning | None = None
+    """None: this protocol's servos are given ids and rates with other tools."""
 
     def use_traits(self, traits: LineTraits) -> None:
-        """Whatever it carries."""
-
-    def explain(self, servo: str, error: DeviceError) -> None:
-        """Nothing more can be asked."""
+        """Learn what the line carries; called before the first request."""
 
 
 @dataclass(frozen=True, slots=True)

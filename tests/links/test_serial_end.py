@@ -102,7 +102,7 @@ async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
         pty.unplug()
         calls: dict[str, Callable[[], object]] = {
             "write": lambda: transport.write(b"x"),
-            "poll_input": transport.look,
+            "poll_input": transport.poll_input,
             "set_baudrate": lambda: transport.set_baudrate(9_600),
         }
         calls[verb]()

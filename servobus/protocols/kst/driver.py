@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
-from servobus.protocols.base import GoalPlan, PlainDriver, Plan, Poll, Request, ask
+from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
 from servobus.protocols.kst.commissioning import Commissioning
@@ -29,8 +29,10 @@ VERBS = {"goal_position": "use move", "id": "use commissioning (set_id)", "baud_
 """Registers that another verb writes."""
 
 
-class KstDriver(PlainDriver):
+class KstDriver(Driver):
     """See `protocols.base.Driver`."""
+
+    commissioning: Commissioning
 
     def __init__(self, options: KstBus, models: Mapping[str, KstModel]) -> None:
         self.options = options
@@ -59,7 +61,7 @@ class KstDriver(PlainDriver):
         free = (node for node in range(last, first - 1, -1) if node not in self.by_node)
         return Read(self.timing, next(free, last), Command.READ_ID, _nothing, once=True)
 
-    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
         """There is one form of each read only, so fences take turns: the answer to a fence that was given up must not be taken
         for the next one's. An enabled servo that stands where nobody sent it has restarted."""
         used = list(avoid)
@@ -71,7 +73,7 @@ class KstDriver(PlainDriver):
                 used += (command, Command.READ_POSITION)
         return (yield from self._recover(node, fence_command(used), enabled))
 
-    def _recover(self, node: int, command: Command, enabled: bool) -> Plan[bool]:
+    def _recover(self, node: int, command: Command, enabled: Collection[str]) -> Plan[bool]:
         yield from ask(Fence(self.timing, node, command, self.commissioning.own_ids(node)))
         servo = self.by_node.get(node)
         if servo is None or not enabled:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, ServobusError, UnknownName
-from servobus.protocols.base import GoalPlan, LineTraits, Plan, Poll, Request, ask
+from servobus.protocols.base import Driver, GoalPlan, LineTraits, Plan, Poll, Request, ask
 from servobus.protocols.modbus.codec import MAX_UNIT, Function
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, FrameTiming, Probe
 from servobus.protocols.roh import goals, stop
@@ -36,8 +36,10 @@ HEALTH = ("status", "current")
 SPAN = re.compile(r"(0[xX][0-9a-fA-F]+|\d+):(\d+)")
 
 
-class RohDriver:
+class RohDriver(Driver):
     """See `protocols.base.Driver`."""
+
+    commissioning: Commissioning
 
     def __init__(self, options: RohBus, models: Mapping[str, RohModel]) -> None:
         self.options = options
@@ -85,7 +87,7 @@ class RohDriver:
         free = (unit for unit in range(MAX_UNIT, 0, -1) if unit not in self.hands)
         return Fence(self.timing, next(free, MAX_UNIT), FIRST, 1, _nothing, refusable=True)
 
-    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
         """The map is looked at again on the way. A hand whose targets or settings are not what we left there has restarted."""
         hand = self._hand_of(node)
         used = [key[1][0] // 2 for key in avoid if isinstance(key, tuple) and key[0] == Function.READ_HOLDING]
@@ -100,16 +102,16 @@ class RohDriver:
                 used.append(fence.count)
         if heard is not None and fence.address == FIRST and hand.doubts(heard):
             return not enabled
-        return not enabled or (yield from self._kept(hand))
+        return not enabled or (yield from self._kept(hand, enabled))
 
     def _fence(self, node: int, used: Sequence[int]) -> Fence[Sequence[int]]:
         count = fence_count(used, self.limits.read)
         address = FIRST if count in TOLD else ELSEWHERE
         return Fence(self.timing, node, address, count, list, refusable=not used)
 
-    def _kept(self, hand: Hand) -> Plan[bool]:
+    def _kept(self, hand: Hand, enabled: Collection[str]) -> Plan[bool]:
         """Whether the enabled fingers' registers still hold what we left there. A device failure is a hand that initialises."""
-        wanted = {finger: (finger.target_name, *finger.settings) for finger in hand.fingers if finger.enabled}
+        wanted = {finger: (finger.target_name, *finger.settings) for finger in hand.fingers if finger.name in enabled}
         if not wanted:
             return True
         try:

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError, UnknownName
-from servobus.protocols.base import GoalPlan, PlainDriver, Plan, Poll, Request, ask
+from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS, GoalWriter
@@ -29,7 +29,7 @@ COMMISSIONING = frozenset({"id", "baud_rate", "response_status_level"})
 SPAN = re.compile(r"(0[xX][0-9a-fA-F]+|\d+):(\d+)")
 
 
-class SmsDriver(PlainDriver):
+class SmsDriver(Driver):
     """See `protocols.base.Driver`."""
 
     def __init__(self, options: SmsBus, models: Mapping[str, SmsModel]) -> None:
@@ -46,10 +46,6 @@ class SmsDriver(PlainDriver):
     def acknowledged(self) -> bool:
         return self._writer.acknowledged
 
-    @property
-    def commissioning(self) -> None:
-        """FEETECH servos are given ids and rates with the vendor's tool."""
-
     def step(self, servo: str) -> float:
         return self.servos[servo].calibration.unit_per_step
 
@@ -62,7 +58,7 @@ class SmsDriver(PlainDriver):
         free = (node for node in range(MAX_ID, -1, -1) if node not in self.by_node)
         return Ping(next(free))
 
-    def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
+    def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
         used = list(avoid)
         for attempt in range(FENCE_TRIES):
             size = fence_size(used)

@@ -26,11 +26,11 @@ def test_when_all_are_under_way_the_oldest_is_asked_again(oldest: Command) -> No
 def test_a_fence_that_was_not_answered_is_followed_by_another_kind() -> None:
     bench = Bench()
     bench.loses = lambda request: request.command == Command.READ_ID  # type: ignore[attr-defined]
-    assert bench.run(bench.driver.fence(1, [], False))
+    assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames() == [encode(1, Command.READ_ID), encode(1, Command.READ_VERSION)]
     bench.loses = lambda request: True
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(1, [Command.READ_ID], False))
+        bench.run(bench.driver.fence(1, [Command.READ_ID], ()))
     assert bench.frames() == [encode(1, Command.READ_VERSION), encode(1, Command.READ_STATUS)]
 
 
@@ -41,12 +41,12 @@ def test_behind_a_fence_the_position_is_asked_once_or_behind_another_fence() -> 
     bench.frames()
     lost = iter((False, True, False, False))
     bench.loses = lambda request: next(lost)
-    assert bench.run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
     asked = [frame[3] for frame in bench.frames()]
     assert asked == [Command.READ_ID, Command.READ_POSITION, Command.READ_VERSION, Command.READ_POSITION]
     bench.loses = lambda request: request.frame[3] == Command.READ_POSITION
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(1, [], True))
+        bench.run(bench.driver.fence(1, [], bench.driver.nodes))
     assert [frame[3] for frame in bench.frames()] == asked
 
 
@@ -54,7 +54,7 @@ def test_a_late_answer_never_passes_for_a_newer_one() -> None:
     """A servo that answers in order, and late: whatever it says is older than what was asked last, until the fence has passed."""
     bench = Bench()
     asked = bench.driver.read_register("pan", "position")
-    plan = bench.driver.fence(1, [asked.reply_key], False)
+    plan = bench.driver.fence(1, [asked.reply_key], ())
     first = next(plan)
     second = plan.throw(ReplyTimeout("late"))
     late = [frame_of(encode(1, 0x40 + request.frame[3], b"\1")) for request in (asked, first, second)]
@@ -65,13 +65,13 @@ def test_a_late_answer_never_passes_for_a_newer_one() -> None:
 def test_after_a_new_id_the_fence_knows_both() -> None:
     bench = Bench()
     bench.run(bench.driver.commissioning.set_id(1, 7))
-    assert bench.run(bench.driver.fence(1, [], False))
+    assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames()[-1] == encode(1, Command.READ_ID)
     bench.devices[0].says = {Command.READ_ID: b"\7"}
-    assert bench.run(bench.driver.fence(1, [], False))
+    assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames() == [encode(1, Command.READ_ID)]
     bench.devices[0].says = {Command.READ_ID: b"\x08"}
-    assert bench.run(bench.driver.fence(1, [], False))
+    assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames() == [encode(1, Command.READ_ID), encode(1, Command.READ_VERSION)]
 
 
@@ -79,34 +79,34 @@ def test_a_servo_that_stands_where_nobody_sent_it_has_restarted() -> None:
     """K21."""
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
-    assert bench.run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
     for turn in bench.driver.plan_goals([goal("pan", 60)], together=False, confirm=False):
         bench.run(turn.plan)
-    assert bench.after(1).run(bench.driver.fence(1, [], True))
+    assert bench.after(1).run(bench.driver.fence(1, [], bench.driver.nodes))
     bench.devices[0].reboot(1.0)
     bench.devices[0].goal = -300.0
     bench.after(1)
-    assert bench.run(bench.driver.fence(1, [], False))
-    assert not bench.after(1).run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], ()))
+    assert not bench.after(1).run(bench.driver.fence(1, [], bench.driver.nodes))
     assert bench.driver.fault_names("pan", None) == ("restarted",)
     bench.run(bench.driver.enable("pan"))
-    assert bench.run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
 
 
 def test_a_restart_that_changes_nothing_is_not_seen() -> None:
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
     bench.devices[0].reboot(0.0)
-    assert bench.after(1).run(bench.driver.fence(1, [], True))
+    assert bench.after(1).run(bench.driver.fence(1, [], bench.driver.nodes))
 
 
 def test_a_servo_that_refuses_to_say_where_it_stands_is_believed() -> None:
     bench = Bench()
     bench.devices[0].refuses = {Command.READ_POSITION: 0x06010000}
-    assert bench.run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
 
 
 def test_a_node_nobody_configured_can_be_fenced_too() -> None:
     bench = Bench({})
     bench.devices.append(Bench({"x": {"id": FACTORY_ID}}).devices[0])
-    assert bench.run(bench.driver.fence(FACTORY_ID, [], True))
+    assert bench.run(bench.driver.fence(FACTORY_ID, [], bench.driver.nodes))

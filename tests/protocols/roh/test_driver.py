@@ -158,49 +158,49 @@ def test_a_fence_reads_a_number_of_registers_that_is_not_under_way() -> None:
 def test_every_fence_is_answered_by_every_map(name: str, under_way: list[int]) -> None:
     bench = bench_of(name)
     bench.hand.refuses_write_only = True
-    assert bench.run(bench.driver.fence(2, [*outstanding(*under_way), reply_key(16, pack((1, 2)))], False))
+    assert bench.run(bench.driver.fence(2, [*outstanding(*under_way), reply_key(16, pack((1, 2)))], ()))
     assert len(bench.frames()) == 1
 
 
 def test_a_fence_that_was_not_answered_is_followed_by_another() -> None:
     bench = Bench()
     bench.loses = lambda request: request.frame[5] == 1
-    assert bench.run(bench.driver.fence(2, [], False))
+    assert bench.run(bench.driver.fence(2, [], ()))
     assert bench.frames() == ["unit 2 READ 1000", "unit 2 READ 1000 to 1001"]
     bench.loses = lambda request: True
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(2, outstanding(6), False))
+        bench.run(bench.driver.fence(2, outstanding(6), ()))
     assert len(bench.frames()) == 2
 
 
 def test_a_hand_that_initialises_answers_a_fence_when_nothing_else_is_under_way() -> None:
     bench = Bench()
     bench.hand.max_registers = 0
-    assert bench.run(bench.driver.fence(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(2, outstanding(6), False))
+        bench.run(bench.driver.fence(2, outstanding(6), ()))
 
 
 @MAPS
 def test_a_restart_shows_in_the_targets(name: str) -> None:
     bench = bench_of(name).enable("index", "ring")
-    assert bench.run(bench.driver.fence(2, [], True)), "nothing has changed"
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)), "nothing has changed"
     assert isinstance(bench.move(goal("index", 50)), dict)
-    assert bench.run(bench.driver.fence(2, outstanding(1), True))
+    assert bench.run(bench.driver.fence(2, outstanding(1), bench.driver.nodes))
     bench.hand.reboot(bench.now)
     bench.after(5)
-    assert bench.run(bench.driver.fence(2, [], False)), "nobody asked"
-    assert not bench.run(bench.driver.fence(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], ())), "nobody asked"
+    assert not bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     assert not any(finger.enabled for finger in bench.driver.fingers.values())
 
 
 def test_a_restart_shows_in_the_speeds() -> None:
     bench = Bench().enable("index")
     bench.move(goal("index", 0, speed=20))
-    assert bench.run(bench.driver.fence(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     bench.hand.reboot(bench.now)
     bench.after(5)
-    assert not bench.run(bench.driver.fence(2, [], True))
+    assert not bench.run(bench.driver.fence(2, [], bench.driver.nodes))
 
 
 @pytest.mark.parametrize("busy", [True, False])
@@ -209,16 +209,16 @@ def test_a_hand_that_initialises_has_restarted(busy: bool) -> None:
     bench.hand.refuses_reads_while_busy = True
     bench.hand.state = "init" if busy else "work"
     bench.hand._ready = 99.0
-    assert bench.run(bench.driver.fence(2, [], True)) is not busy
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)) is not busy
 
 
 def test_another_hand_in_its_place_is_asked_anew() -> None:
     bench = Bench().enable("index")
     bench.devices = bench_of("v1").devices
-    assert not bench.run(bench.driver.fence(2, [], True))
+    assert not bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     with pytest.raises(DeviceError, match="another hand answers in its place"):
         bench.driver.check_goal(goal("index", 50))
-    assert bench.run(bench.driver.fence(2, [], True)), "it is told once"
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)), "it is told once"
     bench.run(bench.driver.identify("index"))
     assert bench.driver.hands[2].map.name == "v1"
     bench.devices = Bench().devices
@@ -231,7 +231,7 @@ def test_targets_that_may_have_been_applied_are_no_restart() -> None:
     bench.loses = lambda request: request.frame[1] == 16
     assert isinstance(bench.move(goal("index", 50))["index"], ReplyTimeout)
     bench.loses = lambda request: False
-    assert bench.run(bench.driver.fence(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
 
 
 def test_a_finger_nobody_configured() -> None:

@@ -52,7 +52,7 @@ def test_degrees_and_percent_have_registers_of_their_own() -> None:
     assert bench.frames() == ["unit 2 WRITE 1135 = 32768", "unit 2 WRITE 1137 = 32768", "unit 2 WRITE 1156 = 15050"]
     assert bench.after(3).read("index", "position") == pytest.approx(100 * (178.37 - 150.5) / 78.15, abs=0.01)
     assert bench.read("index", "angle") == pytest.approx(150.5, abs=0.02)
-    assert bench.run(bench.driver.fence(2, [], True)), "an angle may read back a little otherwise"
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)), "an angle may read back a little otherwise"
 
 
 @pytest.mark.parametrize("together", [True, False])

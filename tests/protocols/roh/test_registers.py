@@ -55,7 +55,7 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
     assert bench.exchange(bench.driver.read_state("index"))["index"]["position"] == 0
     for servo in CHANNELS:
         bench.run(bench.driver.enable(servo))
-    assert bench.run(bench.driver.fence(2, [], True))
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     assert max(request.frame[5] for request in bench.said if request.frame[1] == READ) == 12
     with pytest.raises(NotSupported, match=r"18 words, the line carries 12 at once: read it in parts, 2000:12"):
         bench.driver.read_register("thumb_bend", "force_ex")

@@ -24,7 +24,7 @@ def test_hold_is_target_to_present() -> None:
     assert at_once == "unit 2 WRITE 1135 to 1140 =" + " 13107" * 6
     assert where == "unit 2 READ 1145 to 1150"
     assert again == "unit 2 WRITE 1135 to 1140 =" + " 16384" * 6
-    assert bench.run(bench.driver.fence(2, [], True)), "a stop is no restart"
+    assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)), "a stop is no restart"
 
 
 def test_what_was_not_enabled_is_left_alone() -> None:

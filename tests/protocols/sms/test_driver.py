@@ -123,25 +123,25 @@ def test_a_fence_has_a_length_that_nothing_under_way_has() -> None:
 
 def test_recovery_asks_for_the_id_and_for_the_sentinel_of_what_was_enabled() -> None:
     bench = Bench()
-    assert bench.run(bench.driver.fence(1, [3], False))
+    assert bench.run(bench.driver.fence(1, [3], ()))
     assert [packet.params.hex(" ") for packet in bench.said] == ["05 04"]
     bench.enable()
-    assert bench.run(bench.driver.fence(1, [], True))
+    assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
     assert [packet.params.hex(" ") for packet in bench.said] == ["05 03", "29 01"]
     bench.devices[1].reboot(0.0)
     bench.now = 100.0
-    assert not bench.run(bench.driver.fence(1, [], True)), "it has restarted"
+    assert not bench.run(bench.driver.fence(1, [], bench.driver.nodes)), "it has restarted"
     bench.said.clear()
     bench.deaf = lambda packet: True
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(1, [3], True))
+        bench.run(bench.driver.fence(1, [3], bench.driver.nodes))
     assert [packet.params[1] for packet in bench.said] == [4, 5], "never the same length twice"
 
 
 def test_a_servo_nobody_configured_can_be_fenced_too() -> None:
     bench = Bench()
     with pytest.raises(ReplyTimeout):
-        bench.run(bench.driver.fence(99, [], True))
+        bench.run(bench.driver.fence(99, [], bench.driver.nodes))
 
 
 def test_ping_and_a_question_nobody_answers() -> None:
