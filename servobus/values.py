@@ -25,6 +25,17 @@ class Outcome(StrEnum):
     """A newer goal of the same servo took its place before it left."""
 
 
+class Health(StrEnum):
+    """What servobus believes of a node."""
+
+    ONLINE = "online"
+    """It answers what it is asked."""
+    DOUBTFUL = "doubtful"
+    """A reply is missing or came unasked; a fence comes before the next request to it."""
+    OFFLINE = "offline"
+    """It missed several replies in a row. It is probed with growing pauses, and nobody waits for it."""
+
+
 GoalKind: TypeAlias = Literal["position", "velocity"]
 
 
@@ -93,8 +104,8 @@ class State:
     enabled: bool = False
     faults: tuple[str, ...] = ()
     status: int | None = None
-    health: str = "offline"
-    """online, doubtful or offline."""
+    health: Health = Health.OFFLINE
+    """Whether its node answers."""
     time: float | None = None
     """Monotonic seconds of the newest field."""
     age: float | None = None
@@ -137,6 +148,8 @@ class StopTarget:
     """Enabled by us; one that is not is asked whether its torque is on before it is held."""
     position: float | None = None
     """The present position, if it is fresh enough to be written at once."""
+    setpoint: float | None = None
+    """The last position that was sent or held; None: not known."""
     reachable: bool = True
     """False: known to be offline; it is written to, and not waited for."""
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from servobus.engine.health import Node
 from servobus.protocols.options import ServoOptions
-from servobus.values import Identity, State, Update
+from servobus.values import Health, Identity, State, Update
 
 
 class ServoRecord:
@@ -74,7 +74,7 @@ class ServoRecord:
             enabled=self.enabled,
             faults=faults,
             status=status,
-            health=self.node.condition.value,
+            health=Health(self.node.condition.value),
             time=self.updated_at,
             age=None if self.updated_at is None else now - self.updated_at,
         )

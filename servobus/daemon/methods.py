@@ -48,7 +48,7 @@ def health(client: Connection, _: rpc.Nothing) -> Health:
     rig = client.door.rig
     states = rig.snapshot()
     buses = {name: bus.master.up for name, bus in rig.buses.items()}
-    servos = {name: state.health for name, state in states.items()}
+    servos = {name: state.health.value for name, state in states.items()}
     faults = {name: state.faults for name, state in states.items() if state.faults}
     ok = not rig.stopped and all(buses.values()) and all(each == "online" for each in servos.values())
     return Health(ok, rig.stopped, buses, servos, faults)

@@ -9,7 +9,7 @@ from typing import Any
 
 from servobus.errors import LinkDown
 from servobus.rig.interface import Snapshot
-from servobus.values import State
+from servobus.values import Health, State
 
 
 def received(state: State, now: float) -> State:
@@ -37,7 +37,7 @@ class StateCache:
             name: replace(
                 state,
                 age=None if state.time is None else max(0.0, now - state.time),
-                health=state.health if self.down is None else "offline",
+                health=state.health if self.down is None else Health.OFFLINE,
             )
             for name, state in states.items()
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from servobus import values
 from servobus.bus.records import ServoRecord
 from servobus.engine.health import Health
 from servobus.protocols.options import ServoOptions
@@ -17,7 +18,7 @@ def record() -> ServoRecord:
 
 
 def test_of_a_servo_nobody_heard_nothing_is_known(record: ServoRecord) -> None:
-    assert record.state(5.0, ()) == State(health="doubtful")
+    assert record.state(5.0, ()) == State(health=values.Health.DOUBTFUL)
     assert record.reference() is None
     assert record.position(5.0, 1e9) is None
 

@@ -8,7 +8,7 @@ import pytest
 
 from servobus.errors import LinkDown
 from servobus.remote.cache import LatestSnapshot, StateCache, received
-from servobus.values import State
+from servobus.values import Health, State
 
 NAMES = {"arm/a": ("arm", "a"), "arm/b": ("arm", "b")}
 
@@ -22,8 +22,8 @@ def test_times_are_of_this_machine() -> None:
 def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
     mirror = StateCache()
     mirror.names = NAMES
-    mirror.know({"arm/b": State(position=1.0, time=99.0, age=0.1, health="online"), "arm/gone": State()})
-    assert mirror.snapshot(102.0) == {"arm/a": State(), "arm/b": State(position=1.0, time=99.0, age=3.0, health="online")}
+    mirror.know({"arm/b": State(position=1.0, time=99.0, age=0.1, health=Health.ONLINE), "arm/gone": State()})
+    assert mirror.snapshot(102.0) == {"arm/a": State(), "arm/b": State(position=1.0, time=99.0, age=3.0, health=Health.ONLINE)}
     mirror.know({"arm/b": State(position=2.0, time=103.0)})
     assert mirror.snapshot(102.0)["arm/b"] == State(position=2.0, time=103.0, age=0.0)
 
@@ -31,7 +31,7 @@ def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
 def test_without_a_daemon_everything_is_offline_and_figures_are_none() -> None:
     mirror = StateCache()
     mirror.names = NAMES
-    mirror.know({"arm/b": State(position=1.0, time=99.0, health="online")})
+    mirror.know({"arm/b": State(position=1.0, time=99.0, health=Health.ONLINE)})
     mirror.counted({"arm": {}})
     assert mirror.stats() == {"arm": {}}
     mirror.down = LinkDown("away")
