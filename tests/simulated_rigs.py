@@ -12,8 +12,8 @@ from servobus.config.loader import Config, parse_config
 from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
-from servobus.simulation.build import SimLink, far_end, simulated_line
-from servobus.simulation.pty import SimPty
+from servobus.simulation.link import SimulatedLink, far_end, simulated_line
+from servobus.simulation.pty import SimulatedPty
 
 STS = {
     1: "s1: {id: 1, model: sts, limits: [-90, 90]}",
@@ -33,7 +33,7 @@ def config(*servos: str, port: str = "sim:", **keys: Any) -> Config:
 
 def devices(rig: LocalRig, bus: str = "arm") -> dict[int, SmsDevice]:
     """The simulated servos of a bus in memory, by id."""
-    link = cast("SimLink", rig.supervisors[bus].link)
+    link = cast("SimulatedLink", rig.supervisors[bus].link)
     return {device.node: cast("SmsDevice", device) for device in link.line.devices}
 
 
@@ -42,7 +42,10 @@ async def pty_rig(setup: Config, **options: Any) -> AsyncIterator[LocalRig]:
     """The same bus, but served behind a PTY; the rig opens that like any port."""
     loop = asyncio.get_running_loop()
     simulated, models = setup.buses["arm"], setup.models["arm"]
-    with closing(simulated_line(simulated, models, loop)) as line, closing(SimPty(far_end(simulated, line, loop), loop)) as pty:
+    with (
+        closing(simulated_line(simulated, models, loop)) as line,
+        closing(SimulatedPty(far_end(simulated, line, loop), loop)) as pty,
+    ):
         real = simulated.model_copy(update={"port": pty.path, "faults": None})
         async with open_rig(Config(version=1, buses={"arm": real}, models=setup.models), **options) as rig:
             yield rig

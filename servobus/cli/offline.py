@@ -15,7 +15,7 @@ from servobus.links.ports import list_ports
 from servobus.protocols.base import Codec, LineTraits
 from servobus.protocols.options import BusOptions
 from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.build import SIMULATED
+from servobus.simulation.link import SIMULATED
 
 
 @click.command()

@@ -23,7 +23,7 @@ from servobus.links import TUNNELS, check_port
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions, Name, ServoOptions
 from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.build import SIMULATED, has_wire_time
+from servobus.simulation.link import SIMULATED, has_wire_time
 
 P = TypeVar("P", bound=BaseModel)
 VERSION = 1

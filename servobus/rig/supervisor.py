@@ -20,7 +20,7 @@ from servobus.links.base import Link
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.build import SIMULATED, SimLink, simulated_link
+from servobus.simulation.link import SIMULATED, SimulatedLink, simulated_link
 from servobus.values import StopReport
 
 Trace = Callable[[str, bool, bytes, float], None]
@@ -118,5 +118,5 @@ class BusSupervisor:
     async def close(self) -> None:
         """Once nobody opens the line again."""
         await self.bus.master.close()
-        if isinstance(self.link, SimLink):
+        if isinstance(self.link, SimulatedLink):
             self.link.close()

@@ -31,7 +31,7 @@ class Saying:
     data: bytes
 
 
-class SimLine:
+class SimulatedLine:
     """The far end of a line with devices. `devices` may be changed and reached into at any time."""
 
     def __init__(

@@ -26,7 +26,7 @@ FULL, HALF = 0.1, 0.05
 user waits, as with a UART."""
 
 
-class SimPty:
+class SimulatedPty:
     """Open from the start. `path` is what a user opens: the link if one was asked for."""
 
     def __init__(

@@ -15,9 +15,9 @@ import anyio
 
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
-from servobus.simulation.arm import address, arm_server, is_arm
-from servobus.simulation.build import far_end, simulated_line
-from servobus.simulation.pty import SimPty
+from servobus.simulation.arm_server import address, arm_server, is_arm
+from servobus.simulation.link import far_end, simulated_line
+from servobus.simulation.pty import SimulatedPty
 
 
 async def serve(
@@ -40,7 +40,7 @@ async def serve(
             line = stack.enter_context(closing(simulated_line(options, models[name], loop)))
             symlink = folder / name if folder else None
             far = far_end(options, line, loop)
-            paths[name] = stack.enter_context(closing(SimPty(far, loop, backlog=line.backlog, symlink=symlink))).path
+            paths[name] = stack.enter_context(closing(SimulatedPty(far, loop, backlog=line.backlog, symlink=symlink))).path
         for name, path in paths.items():
             announce(name, path)
         await anyio.sleep_forever()

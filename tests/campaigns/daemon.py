@@ -105,8 +105,8 @@ async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
     """On a simulated line of a process of its own, which sees what is written at each start."""
     from servobus.config.loader import parse_config
     from servobus.links.base import FarEnd
-    from servobus.simulation.build import far_end, simulated_line
-    from servobus.simulation.pty import SimPty
+    from servobus.simulation.link import far_end, simulated_line
+    from servobus.simulation.pty import SimulatedPty
 
     loop, result = asyncio.get_running_loop(), Killed()
     setup = parse_config(RIG % '"sim:"' + SERVOS, "campaign")
@@ -121,7 +121,7 @@ async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
         heard(data)
 
     inner.receive = receive  # type: ignore[method-assign]
-    pty = SimPty(inner, loop)
+    pty = SimulatedPty(inner, loop)
     try:
         with daemon(folder, pty.path) as process:
             current = process

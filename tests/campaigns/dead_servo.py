@@ -16,9 +16,9 @@ from servobus.config.loader import Config, parse_config
 from servobus.errors import LinkDown, ServobusError
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
-from servobus.simulation.build import simulated_line
-from servobus.simulation.line import SimLine
-from servobus.simulation.pty import SimPty
+from servobus.simulation.line import SimulatedLine
+from servobus.simulation.link import simulated_line
+from servobus.simulation.pty import SimulatedPty
 
 SERVOS = 10
 BAUDRATE = 1_000_000
@@ -68,7 +68,7 @@ async def _campaign(seconds: float) -> Figures:
         port = Path(folder) / "port"
         setup = config(port)
         line = simulated_line(setup.buses["arm"], setup.models["arm"], loop)
-        pty = SimPty(line, loop, symlink=port)
+        pty = SimulatedPty(line, loop, symlink=port)
         try:
             async with open_rig(setup) as rig:
                 figures.rate_before = await _rate(rig, seconds)
@@ -77,7 +77,7 @@ async def _campaign(seconds: float) -> Figures:
                 used = time.process_time()
                 await asyncio.sleep(seconds)
                 figures.cpu = (time.process_time() - used) / seconds
-                pty = SimPty(line, loop, symlink=port)
+                pty = SimulatedPty(line, loop, symlink=port)
                 figures.replug = await _until(lambda: rig.read("s2"))
         finally:
             pty.close()
@@ -98,7 +98,7 @@ async def _rate(rig: LocalRig, seconds: float) -> float:
     return sum(await asyncio.gather(*(caller(f"s{number}") for number in range(2, SERVOS + 1)))) / seconds
 
 
-async def _dead_servo(rig: LocalRig, line: SimLine, figures: Figures, seconds: float) -> None:
+async def _dead_servo(rig: LocalRig, line: SimulatedLine, figures: Figures, seconds: float) -> None:
     """Measured while callers go on asking the dead one."""
 
     async def ask_the_dead() -> None:
@@ -117,7 +117,7 @@ async def _dead_servo(rig: LocalRig, line: SimLine, figures: Figures, seconds: f
         line.devices[0].dead = False  # type: ignore[attr-defined]
 
 
-async def _unplug(rig: LocalRig, pty: SimPty) -> tuple[float, int]:
+async def _unplug(rig: LocalRig, pty: SimulatedPty) -> tuple[float, int]:
     asked = [asyncio.create_task(rig.read(f"s{number}")) for number in range(2, SERVOS + 1)]
     await asyncio.sleep(0)
     began = time.monotonic()

@@ -14,7 +14,7 @@ from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.registry import PROTOCOLS
 from servobus.protocols.roh.simulated.device import RohDevice
-from servobus.simulation.line import SimLine
+from servobus.simulation.line import SimulatedLine
 from tests.campaigns.faults import HUNG, Result
 from tests.virtual_time import VirtualLoop
 
@@ -39,7 +39,7 @@ async def _slow_hand(reads: int, rng: random.Random) -> Result:
     options, entry, result = config.buses["hand"], PROTOCOLS["roh"], Result()
     hands = [hand for hand in entry.devices(options, config.models["hand"]) if isinstance(hand, RohDevice)]
     loop = asyncio.get_running_loop()
-    with closing(SimLine(hands, entry.device_codec(options), loop, baudrate=options.baudrate)) as line:
+    with closing(SimulatedLine(hands, entry.device_codec(options), loop, baudrate=options.baudrate)) as line:
         link = MemoryLink(line, LineTraits(options.baudrate, paced=True))
         driver = entry.driver(options, config.models["hand"])
         bus = BusService("hand", options, driver, entry.codec(options), link.traits, lambda name, **fields: None)

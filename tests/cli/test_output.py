@@ -12,7 +12,7 @@ from servobus.cli.rig_context import Options, opened
 from servobus.errors import DeviceError
 from servobus.rig.interface import Rig
 from servobus.rig.local import LocalRig
-from servobus.simulation.build import SimLink
+from servobus.simulation.link import SimulatedLink
 from tests.config.mistakes import GOOD
 
 
@@ -25,7 +25,7 @@ def options(tmp_path: Path) -> Options:
 
 def silence(rig: Rig) -> None:
     """From here on nobody answers."""
-    cast("SimLink", cast("LocalRig", rig).supervisors["arm"].link).line.close()
+    cast("SimulatedLink", cast("LocalRig", rig).supervisors["arm"].link).line.close()
 
 
 async def test_how_servos_were_left_is_told_when_nobody_confirms_it(options: Options) -> None:

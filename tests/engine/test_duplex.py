@@ -12,7 +12,7 @@ from servobus.errors import ReplyTimeout
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
-from servobus.simulation.build import SimLink
+from servobus.simulation.link import SimulatedLink
 from tests.virtual_time import virtual
 
 SERVOS = 12
@@ -26,9 +26,9 @@ def config(duplex: str, *, delays: str = "[0, 0.5]", **keys: str):  # type: igno
     return parse_config(f"{head}    duplex: {duplex}\n    reply_delay_ms: {delays}\n{more}    servos:\n{servos}", "test")
 
 
-def link_of(rig: LocalRig) -> SimLink:
+def link_of(rig: LocalRig) -> SimulatedLink:
     link = rig.supervisors["line"].link
-    assert isinstance(link, SimLink)
+    assert isinstance(link, SimulatedLink)
     return link
 
 

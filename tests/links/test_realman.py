@@ -16,7 +16,7 @@ from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
-from servobus.simulation.arm import ArmFaults, ArmServer
+from servobus.simulation.arm_server import ArmFaults, ArmServer
 from servobus.values import Outcome
 
 FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")

@@ -14,7 +14,7 @@ from servobus.errors import DeviceError, LeaseHeld, LimitError, NotSupported, Re
 from servobus.protocols.kst.codec import Command
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.rig.interface import Found
-from servobus.simulation.build import SimLink
+from servobus.simulation.link import SimulatedLink
 from servobus.values import Identity, State
 from tests.rig_kinds import Over, both, gone, two_buses
 from tests.simulated_rigs import config, devices
@@ -157,7 +157,7 @@ async def test_registers(over: Over, tmp_path: Path) -> None:
 @virtual
 async def test_a_device_that_refuses(over: Over, tmp_path: Path) -> None:
     async with over(gimbal(), tmp_path) as (rig, home):
-        link = cast("SimLink", home.supervisors["arm"].link)
+        link = cast("SimulatedLink", home.supervisors["arm"].link)
         pan = cast("KstDevice", link.line.devices[0])
         for code, kind in ((0x06040043, DeviceError), (0x06060000, DeviceError), (0x06010002, NotSupported)):
             pan.refuses[Command.READ_POSITION] = code

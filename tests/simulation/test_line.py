@@ -11,7 +11,7 @@ import pytest
 from servobus.protocols.sms.codec import BROADCAST_ID, Instruction, SmsCodec, encode
 from servobus.protocols.sms.model_loading import packaged_models
 from servobus.protocols.sms.simulated.device import SmsDevice
-from servobus.simulation.line import SimLine, blend, over
+from servobus.simulation.line import SimulatedLine, blend, over
 from tests.virtual_time import virtual
 
 PING = encode(1, Instruction.PING)
@@ -25,7 +25,7 @@ BYTE = 10e-6
 class Listener:
     """The master's ear."""
 
-    def __init__(self, line: SimLine) -> None:
+    def __init__(self, line: SimulatedLine) -> None:
         self.heard: list[bytes] = []
         self.times: list[float] = []
         """When each piece was heard, in seconds since it began to listen."""
@@ -71,7 +71,7 @@ async def listening(
     devices: Sequence[SmsDevice], *, baudrate: int = 1_000_000, wire_time: bool = True
 ) -> AsyncIterator[Listener]:
     loop = asyncio.get_running_loop()
-    with closing(SimLine(devices, SmsCodec(), loop, baudrate=baudrate, wire_time=wire_time)) as line:
+    with closing(SimulatedLine(devices, SmsCodec(), loop, baudrate=baudrate, wire_time=wire_time)) as line:
         yield Listener(line)
 
 
@@ -266,7 +266,7 @@ async def test_a_closed_line_is_silent(wire_time: bool) -> None:
 @virtual
 async def test_a_line_nobody_listens_to_goes_on() -> None:
     """What is said before somebody is attached is lost."""
-    line = SimLine([servo()], SmsCodec(), asyncio.get_running_loop(), baudrate=1_000_000, wire_time=False)
+    line = SimulatedLine([servo()], SmsCodec(), asyncio.get_running_loop(), baudrate=1_000_000, wire_time=False)
     line.receive(PING)
     await asyncio.sleep(0)
     master = Listener(line)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from servobus.simulation.pty import FULL, HALF, SimPty
+from servobus.simulation.pty import FULL, HALF, SimulatedPty
 
 
 class Parrot:
@@ -46,7 +46,7 @@ class Parrot:
 async def test_the_far_end_hears_the_rate_before_the_bytes(baudrate: int) -> None:
     """Standard and custom rates, as pyserial sets them."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop())
+    pty = SimulatedPty(parrot, asyncio.get_running_loop())
     with serial.Serial(pty.path, baudrate, timeout=10) as port:
         port.write(b"\xff\x00\x0d\x0a\x03\x11")
         assert await parrot.news() == [baudrate, b"\xff\x00\x0d\x0a\x03\x11"]
@@ -58,7 +58,7 @@ async def test_the_far_end_hears_the_rate_before_the_bytes(baudrate: int) -> Non
 async def test_users_come_and_go() -> None:
     """The port stays when its user leaves, and the next user may have another rate."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop())
+    pty = SimulatedPty(parrot, asyncio.get_running_loop())
     for baudrate in (57_600, 1_000_000):
         with serial.Serial(pty.path, baudrate) as port:
             port.write(b"here")
@@ -69,7 +69,7 @@ async def test_users_come_and_go() -> None:
 async def test_rate_0_is_no_rate() -> None:
     """Whoever hangs up (B0) has not chosen a rate."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop())
+    pty = SimulatedPty(parrot, asyncio.get_running_loop())
     with serial.Serial(pty.path, 0) as port:
         port.write(b"x")
         assert await parrot.news() == [b"x"]
@@ -79,7 +79,7 @@ async def test_rate_0_is_no_rate() -> None:
 async def test_what_nobody_reads_is_dropped_and_counted() -> None:
     """A line does not wait and does not grow; afterwards it goes on."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop())
+    pty = SimulatedPty(parrot, asyncio.get_running_loop())
     with serial.Serial(pty.path, 115_200, timeout=10) as port:
         for _ in range(1000):
             parrot.deliver(bytes(1000))
@@ -94,7 +94,7 @@ async def test_what_nobody_reads_is_dropped_and_counted() -> None:
 async def test_a_user_who_says_too_much_waits() -> None:
     """As with a UART: behind a slow line the buffers fill, and what is in them is not lost but late."""
     parrot, unsaid = Parrot(), [FULL, FULL + 0.01]
-    pty = SimPty(parrot, asyncio.get_running_loop(), backlog=lambda: unsaid.pop(0))
+    pty = SimulatedPty(parrot, asyncio.get_running_loop(), backlog=lambda: unsaid.pop(0))
     with serial.Serial(pty.path, 115_200) as port:
         for word in (b"first", b"second"):
             port.write(word)
@@ -116,7 +116,7 @@ async def test_a_user_who_says_too_much_waits() -> None:
 async def test_the_plug_can_be_pulled_while_a_user_waits() -> None:
     """Nothing goes on then."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop(), backlog=lambda: HALF + FULL)
+    pty = SimulatedPty(parrot, asyncio.get_running_loop(), backlog=lambda: HALF + FULL)
     with serial.Serial(pty.path, 115_200) as port:
         port.write(b"x")
         await parrot.news()
@@ -128,7 +128,7 @@ async def test_the_plug_can_be_pulled_while_a_user_waits() -> None:
 async def test_closing_pulls_the_plug() -> None:
     """The user gets an error, the path is gone, and what is said then goes nowhere."""
     parrot = Parrot()
-    pty = SimPty(parrot, asyncio.get_running_loop())
+    pty = SimulatedPty(parrot, asyncio.get_running_loop())
     user = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
     pty.close()
     with pytest.raises(OSError, match="Input/output") as caught:
@@ -145,10 +145,10 @@ async def test_a_stable_name_follows_the_plug(tmp_path: Path) -> None:
     """One name, new device behind it: also when the old one is closed after the new one came."""
     name = tmp_path / "ttyServo"
     loop = asyncio.get_running_loop()
-    first = SimPty(Parrot(), loop, symlink=name)
+    first = SimulatedPty(Parrot(), loop, symlink=name)
     assert first.path == str(name)
     parrot = Parrot()
-    second = SimPty(parrot, loop, symlink=name)
+    second = SimulatedPty(parrot, loop, symlink=name)
     first.close()
     with serial.Serial(str(name), 115_200) as port:
         port.write(b"new")
@@ -162,5 +162,5 @@ async def test_a_file_is_never_replaced(tmp_path: Path) -> None:
     name = tmp_path / "precious"
     name.write_text("data")
     with pytest.raises(FileExistsError, match="choose another"):
-        SimPty(Parrot(), asyncio.get_running_loop(), symlink=name)
+        SimulatedPty(Parrot(), asyncio.get_running_loop(), symlink=name)
     assert name.read_text() == "data"

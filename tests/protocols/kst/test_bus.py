@@ -20,7 +20,7 @@ from servobus.protocols.kst.commissioning import Commissioning
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.protocols.options import FaultOptions
-from servobus.simulation.line import SimLine
+from servobus.simulation.line import SimulatedLine
 from servobus.values import Goal, Outcome
 from tests.protocols.kst.bench import bus_options
 from tests.virtual_time import virtual
@@ -47,7 +47,7 @@ async def running(
     models = DEFINITION.models(options, Path())
     events: list[str] = []
     servos = [device for device in DEFINITION.devices(options, models) if isinstance(device, KstDevice)]
-    line = SimLine(servos, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
+    line = SimulatedLine(servos, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
     with closing(line):
         far = line if faults is None else FaultyEnd(line, faults, loop, rename=DEFINITION.rename, node_of=DEFINITION.node_of)
         link = MemoryLink(far, LineTraits(options.baudrate, paced=True, can_change_baud=True))

@@ -19,7 +19,7 @@ from servobus.protocols.base import LineTraits
 from servobus.protocols.options import FaultOptions
 from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
-from servobus.simulation.line import SimLine
+from servobus.simulation.line import SimulatedLine
 from servobus.values import Goal, Outcome
 from tests.protocols.roh.bench import HAND, bus_options
 from tests.virtual_time import virtual
@@ -50,7 +50,7 @@ async def running(
     models = DEFINITION.models(options, Path())
     events: list[str] = []
     hands = [device for device in DEFINITION.devices(options, models) if isinstance(device, RohDevice)]
-    line = SimLine(hands, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
+    line = SimulatedLine(hands, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
     with closing(line):
         far = line if faults is None else FaultyEnd(line, faults, loop, rename=DEFINITION.rename, node_of=DEFINITION.node_of)
         paced = faults is None or not faults.echo

@@ -14,7 +14,7 @@ from servobus.protocols.sms.codec import Instruction, encode
 from servobus.protocols.sms.model_loading import packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.device import SmsDevice
-from servobus.simulation.build import SimLink, has_wire_time, simulated_link
+from servobus.simulation.link import SimulatedLink, has_wire_time, simulated_link
 from tests.virtual_time import virtual
 
 PING = encode(1, Instruction.PING)
@@ -45,7 +45,7 @@ class Ear(asyncio.Protocol):
         self.lost = True
 
 
-def link_of(*, wire_time: bool = True, **keys: Any) -> SimLink:
+def link_of(*, wire_time: bool = True, **keys: Any) -> SimulatedLink:
     data = {"protocol": "sms", "port": "sim:", "baudrate": 1_000_000, "servos": {"a": {"id": 1, "model": "sts"}}, **keys}
     return simulated_link(SmsBus.model_validate(data), packaged_models(), wire_time=wire_time)
 

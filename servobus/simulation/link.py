@@ -16,7 +16,7 @@ from servobus.protocols.base import LineTraits
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.line import SimLine
+from servobus.simulation.line import SimulatedLine
 
 SIMULATED = "sim:"
 PORTS = {"sim:": True, "sim:?wire_time=off": False}
@@ -34,11 +34,11 @@ def has_wire_time(port: str) -> bool:
 
 def simulated_line(
     options: BusOptions, models: Mapping[str, ServoModel], loop: asyncio.AbstractEventLoop, *, wire_time: bool = True
-) -> SimLine:
+) -> SimulatedLine:
     """The servos of a bus, each standing at its zero."""
     entry = PROTOCOLS[options.protocol]
     devices = entry.devices(options, models)
-    return SimLine(
+    return SimulatedLine(
         devices,
         entry.device_codec(options),
         loop,
@@ -48,7 +48,7 @@ def simulated_line(
     )
 
 
-def far_end(options: BusOptions, line: SimLine, loop: asyncio.AbstractEventLoop) -> FarEnd:
+def far_end(options: BusOptions, line: SimulatedLine, loop: asyncio.AbstractEventLoop) -> FarEnd:
     """The line as its master meets it: behind the fault injector where the options want one."""
     if options.faults is None:
         return line
@@ -56,10 +56,10 @@ def far_end(options: BusOptions, line: SimLine, loop: asyncio.AbstractEventLoop)
     return FaultyEnd(line, options.faults, loop, rename=entry.rename, node_of=entry.node_of)
 
 
-class SimLink(MemoryLink):
+class SimulatedLink(MemoryLink):
     """A link to a simulated line. The line, and with it what its servos know, outlives every connection."""
 
-    def __init__(self, far: FarEnd, traits: LineTraits, address: str, line: SimLine) -> None:
+    def __init__(self, far: FarEnd, traits: LineTraits, address: str, line: SimulatedLine) -> None:
         super().__init__(far, traits, address)
         self.line = line
         self._baudrate = line.baudrate
@@ -75,7 +75,7 @@ class SimLink(MemoryLink):
         self.line.close()
 
 
-def simulated_link(options: BusOptions, models: Mapping[str, ServoModel], *, wire_time: bool = True) -> SimLink:
+def simulated_link(options: BusOptions, models: Mapping[str, ServoModel], *, wire_time: bool = True) -> SimulatedLink:
     """To be called where a loop runs. `wire_time=False`: bytes take no time, whatever the port says. Raises ConfigError."""
     loop = asyncio.get_running_loop()
     wire_time = has_wire_time(options.port) and wire_time
@@ -83,4 +83,4 @@ def simulated_link(options: BusOptions, models: Mapping[str, ServoModel], *, wir
     # An echo comes from the injector, which keeps no wire time.
     early = options.faults is not None and options.faults.echo > 0
     traits = LineTraits(options.baudrate if wire_time else None, paced=wire_time and not early, can_change_baud=True)
-    return SimLink(far_end(options, line, loop), traits, options.port, line)
+    return SimulatedLink(far_end(options, line, loop), traits, options.port, line)
