@@ -1,7 +1,7 @@
-"""A line that goes wrong as real ones do: it stands before another far end and damages what that says to the master.
+"""A fault injector: it passes bytes between a master and a far end, and damages the replies as a bad line does.
 
-Every fault has a share of the replies it strikes (`FaultOptions`), from a seeded source, so a run can be had again. A node and
-its UART are a queue: behind a reply that is late, the later ones of the same node wait.
+`FaultOptions` gives the share of replies that each fault hits. The random source is seeded, so a run can be repeated. The replies
+of one node keep their order: a reply waits while an earlier one of the same node is delayed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ Rename = Callable[[bytes, random.Random], bytes]
 Damage = Callable[[bytes, random.Random], bytes]
 
 MAX_NOISE = 3
-"""Zero bytes before a reply: what a line without bias resistors shows."""
-LONGEST_PIECE = 5
+"""Zero bytes in front of a reply, as on a line without bias resistors."""
+MAX_PIECE = 5
+"""Bytes that arrive together with `chop: random`."""
 
 
 def _drop_byte(frame: bytes, rng: random.Random) -> bytes:
@@ -46,11 +47,11 @@ DAMAGES: dict[str, Damage] = {
     "duplicate": lambda frame, rng: frame + frame,
     "noise": lambda frame, rng: bytes(rng.randint(1, MAX_NOISE)) + frame,
 }
-"""Fault -> what is left of the frame, in the order in which they strike."""
+"""Fault -> function that returns the damaged frame, in the order in which they are applied."""
 
 
 class FaultyEnd:
-    """See `links.base.FarEnd`. `rename` puts a frame in the name of another node, `node_of` tells whose it is."""
+    """A far end with faults; see `links.base.FarEnd`."""
 
     def __init__(
         self,
@@ -61,18 +62,25 @@ class FaultyEnd:
         rename: Rename,
         node_of: Callable[[bytes], Hashable],
     ) -> None:
+        """Put faults in front of `far`.
+
+        Args:
+            rename: returns a reply frame with another node's id and a valid checksum.
+            node_of: returns the node of a reply frame.
+        """
         self.counts: Counter[str] = Counter()
+        """Fault -> replies it has hit."""
         self._far = far
         self._options = options
         self._loop = loop
         self._rng = random.Random(options.seed)
         self._node_of = node_of
         self._damages = {"wrong_id": rename, **DAMAGES}
-        self._deliver: Callable[[bytes], None] = _nobody
+        self._deliver: Callable[[bytes], None] = _discard
         self._late: dict[Hashable, deque[bytes]] = {}
         self._late_until: dict[Hashable, float] = {}
         self._pieces: deque[bytes] = deque()
-        far.attach(self._heard)
+        far.attach(self._on_reply)
 
     def attach(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver
@@ -81,39 +89,41 @@ class FaultyEnd:
         self._far.set_baudrate(baudrate)
 
     def receive(self, data: bytes) -> None:
-        if self._strikes("echo"):
-            self._say(data)
+        if self._hits("echo"):
+            self._send(data)
         self._far.receive(data)
 
-    def _heard(self, frame: bytes) -> None:
-        """The far end said a frame."""
+    def _on_reply(self, frame: bytes) -> None:
+        """Damage one reply frame of the far end, and pass it on now or later."""
         node = self._node_of(frame)
-        delay = self._rng.uniform(0, self._options.delay_ms / 1000) if self._strikes("late") else 0.0
+        delay = self._rng.uniform(0, self._options.delay_ms / 1000) if self._hits("late") else 0.0
         for name, damage in self._damages.items():
-            if frame and self._strikes(name):
+            if frame and self._hits(name):
                 frame = damage(frame, self._rng)
         if delay or self._late.get(node):
-            self._say_late(node, frame, delay)
+            self._send_late(node, frame, delay)
         else:
-            self._say(frame)
+            self._send(frame)
 
-    def _say_late(self, node: Hashable, frame: bytes, delay: float) -> None:
-        """Behind what this node still has to say. It is the queue that keeps the order: a loop does not, between timers that
-        are due at the same moment."""
+    def _send_late(self, node: Hashable, frame: bytes, delay: float) -> None:
+        """Send a reply after those that the node still has to send.
+
+        The queue keeps their order; the loop does not keep it between timers that are due at the same time.
+        """
         due = max(self._loop.time() + delay, self._late_until.get(node, 0.0))
         self._late_until[node] = due
         queue = self._late.setdefault(node, deque())
         queue.append(frame)
-        self._loop.call_at(due, lambda: self._say(queue.popleft()))
+        self._loop.call_at(due, lambda: self._send(queue.popleft()))
 
-    def _strikes(self, fault: str) -> bool:
+    def _hits(self, fault: str) -> bool:
         share: float = getattr(self._options, fault)
-        struck = share > 0 and self._rng.random() < share
-        self.counts[fault] += struck
-        return struck
+        hit = share > 0 and self._rng.random() < share
+        self.counts[fault] += hit
+        return hit
 
-    def _say(self, data: bytes) -> None:
-        """In pieces, one in each pass of the loop, behind what is still to be said."""
+    def _send(self, data: bytes) -> None:
+        """Queue data behind the pieces that wait; each pass of the loop delivers one piece."""
         if not data:
             return
         if not self._pieces:
@@ -131,10 +141,10 @@ class FaultyEnd:
             yield data
             return
         while data:
-            size = 1 if self._options.chop == "bytes" else self._rng.randint(1, LONGEST_PIECE)
+            size = 1 if self._options.chop == "bytes" else self._rng.randint(1, MAX_PIECE)
             yield data[:size]
             data = data[size:]
 
 
-def _nobody(data: bytes) -> None:
-    """Where nothing is attached, nothing is heard."""
+def _discard(data: bytes) -> None:
+    """Drop what arrives while no master is attached."""

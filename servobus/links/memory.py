@@ -1,4 +1,4 @@
-"""A line that exists only in this process: what the master says goes to a far end, and what that says comes back."""
+"""A line inside this process: the bytes of the master go to a far end, and its replies come back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from servobus.protocols.base import LineTraits
 
 
 class MemoryLink:
-    """See `links.base.Link`. `unplug` and `plug` do what hands do to an adapter."""
+    """A link to a far end; see `links.base.Link`. `unplug` and `plug` act as if a person did it to an adapter."""
 
     def __init__(self, far: FarEnd, traits: LineTraits, address: str = "sim:") -> None:
         self.traits = traits
@@ -21,8 +21,8 @@ class MemoryLink:
         far.attach(self._deliver)
 
     async def connect(self, protocol: asyncio.Protocol) -> MemoryTransport:
-        """Raises PortMissing while unplugged, PortBusy while open."""
-        await asyncio.sleep(0)  # whoever had it open before has been told by then that it is lost
+        """Open the line. Raises PortMissing while it is unplugged, PortBusy while it is open."""
+        await asyncio.sleep(0)  # lets a transport that was just closed report its connection_lost first
         if not self._plugged:
             raise PortMissing(f"{self.address} is unplugged: plug it in")
         if self._open is not None and not self._open.is_closing():
@@ -32,13 +32,13 @@ class MemoryLink:
         return self._open
 
     def unplug(self) -> None:
-        """Whoever has it open is told, and it cannot be opened."""
+        """End an open connection with LinkDown, and let nobody open another one."""
         self._plugged = False
         if self._open is not None:
             self._open.lose(LinkDown(f"{self.address} was unplugged: plug it in again"))
 
     def plug(self) -> None:
-        """It can be opened again."""
+        """Let it be opened again."""
         self._plugged = True
 
     def _deliver(self, data: bytes) -> None:
@@ -47,7 +47,7 @@ class MemoryLink:
 
 
 class MemoryTransport(asyncio.Transport):
-    """See `links.base.Transport`."""
+    """An open connection to a far end; see `links.base.Transport`."""
 
     def __init__(self, protocol: asyncio.Protocol, far: FarEnd, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class MemoryTransport(asyncio.Transport):
             self._protocol.data_received(data)
 
     def poll_input(self) -> bool:
-        """There is nowhere to look: what was said is delivered by the loop."""
+        """Return False: the loop delivers the bytes, and there is no buffer to read."""
         return False
 
     def set_baudrate(self, baudrate: int) -> None:
@@ -81,7 +81,7 @@ class MemoryTransport(asyncio.Transport):
         self.lose(None)
 
     def lose(self, error: LinkDown | None) -> None:
-        """Tell the protocol once, and not from within its own call."""
+        """Report `connection_lost` once, in a later pass of the loop."""
         if not self._closing:
             self._closing = True
             self._loop.call_soon(self._protocol.connection_lost, error)

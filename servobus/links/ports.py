@@ -1,4 +1,4 @@
-"""Which serial ports this machine has, by every name they go under, and who holds them."""
+"""The serial ports of this machine: their names, what the system knows about each adapter, and the process that has it open."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from serial.tools.list_ports_common import ListPortInfo
 from servobus.links.tty import find_holder
 
 LINK_FOLDERS = (Path("/dev/serial/by-id"), Path("/dev/serial/by-path"))
-"""Where udev puts names that stay the same whatever is plugged in first."""
+"""Folders of udev links whose names do not depend on the order in which adapters are plugged in."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """One port. What the system does not tell is None."""
+    """One port. A field is None where the system does not know it."""
 
     device: str
     by_id: str | None
-    """The name to write into a config: it belongs to the adapter."""
+    """The link named after the adapter (maker, product, serial number): the best name for a config."""
     by_path: str | None
-    """The name that belongs to the socket the adapter is plugged into."""
+    """The link named after the socket that the adapter is plugged into."""
     description: str | None
     manufacturer: str | None
     serial_number: str | None
     vid: int | None
     pid: int | None
     holder: tuple[int, str] | None
-    """Process that has it open, and its name."""
+    """Process id and name of the program that has it open."""
 
 
 def list_ports() -> list[PortInfo]:
-    """In the order of their device names."""
+    """Return the ports in the order of their device names."""
     by_id, by_path = (links_in(folder) for folder in LINK_FOLDERS)
     return [describe(port, by_id, by_path) for port in sorted(serial_ports.comports())]
 
 
 def describe(port: ListPortInfo, by_id: Mapping[str, str], by_path: Mapping[str, str]) -> PortInfo:
-    """What pyserial found, together with its other names and its holder."""
+    """Return what pyserial reports about a port, with its other names and its holder."""
     return PortInfo(
         device=port.device,
         by_id=by_id.get(port.device),
@@ -56,7 +56,7 @@ def describe(port: ListPortInfo, by_id: Mapping[str, str], by_path: Mapping[str,
 
 
 def links_in(folder: Path) -> dict[str, str]:
-    """Device -> link that leads to it; none where udev made no such folder."""
+    """Return device -> link to it. Empty where the folder does not exist."""
     try:
         return {os.path.realpath(link): str(link) for link in sorted(folder.iterdir())}
     except OSError:

@@ -1,8 +1,12 @@
-"""Through a RealMan arm: Modbus-RTU frames go in and come out, JSON lines travel (ROH seed 2).
+"""A RealMan arm as a line: Modbus-RTU frames go in and come out, and JSON lines travel (RealMan JSON).
 
-To the engine it is a line. One command is under way at a time. The arm's replies say which command they answer and not which
-question, so before a question that looks like an earlier one the arm is asked who it is: its answer cannot be mistaken, and
-whatever comes before it is dropped. An arm that does not answer at all is left, and called anew.
+One command is in flight at a time. A reply of the arm names the command that it answers, but not the request. How a late reply is
+kept from being taken for a later one:
+
+* A command may be sent if no reply since the last fence can be confused with its own (`ArmCommand.reply_key`), and no command of
+  that name failed since then, for all failures of a command look the same.
+* Otherwise a fence is sent first: the arm is asked for its software version. Everything before that reply is discarded.
+* If the arm does not answer at all, the connection is closed, and the supervisor opens another one.
 """
 
 from __future__ import annotations
@@ -11,24 +15,24 @@ import asyncio
 from collections.abc import Callable
 
 from servobus.errors import LinkDown
-from servobus.links.tcp import CONNECT_TIMEOUT, OPTIONS, explain
+from servobus.links.tcp import CONNECT_TIMEOUT, OPTIONS, explain_connect_error
 from servobus.protocols.base import LineTraits
 from servobus.protocols.modbus.codec import BROADCAST, Frame, ModbusCodec
 from servobus.protocols.realman import codec
-from servobus.protocols.realman.codec import Dialect, Lines, Message, Step
-from servobus.protocols.realman.requests import Question
+from servobus.protocols.realman.codec import ArmCommand, Dialect, JsonLines, Message
+from servobus.protocols.realman.requests import TunnelRequest
 
 LATENCY = 0.020
 """Seconds an arm takes for one command, at the least."""
 HAND_TIMEOUT = 0.1
-"""Seconds the arm waits for the hand before it says that it failed; its smallest setting."""
+"""Seconds the arm waits for the hand before it reports a failure; its smallest setting."""
 ANSWER_TIMEOUT = 1.0
-"""Seconds for the arm's own answers: half of it, and a margin, is what the vendor's client waits beyond the hand's timeout."""
-Wanted = Callable[[Message], bool]
+"""Seconds the arm gets for its own replies. The vendor's client waits about 0.5 s beyond the hand's timeout."""
+Accept = Callable[[Message], bool]
 
 
 class RealmanLink:
-    """See `links.base.Link`. `generation` None: the arm is asked. `volts` None: the tool's power is left as it is."""
+    """The address of an arm; see `links.base.Link`."""
 
     def __init__(
         self,
@@ -40,8 +44,9 @@ class RealmanLink:
         generation: int | None = None,
         volts: int | None = None,
     ) -> None:
-        where = f"[{host}]" if ":" in host else host
-        self.address = f"realman://{where}:{tcp_port}?port={port}"
+        """`generation`: None asks the arm. `volts`: the supply at the tool; None leaves it as it is."""
+        netloc = f"[{host}]" if ":" in host else host
+        self.address = f"realman://{netloc}:{tcp_port}?port={port}"
         self._host = host
         self._tcp_port = tcp_port
         self._baudrate = baudrate
@@ -51,13 +56,13 @@ class RealmanLink:
         self.traits = self._traits(codec.dialect(generation or 2, port))
 
     def _traits(self, dialect: Dialect) -> LineTraits:
-        latency = LATENCY + HAND_TIMEOUT  # a hand that is silent shows as the arm's no, which is worth waiting for
+        latency = LATENCY + HAND_TIMEOUT  # the arm reports a hand that is silent, and that report is waited for
         return LineTraits(
             self._baudrate, latency=latency, turn=2 * LATENCY, max_read=dialect.max_read, max_write=dialect.max_write
         )
 
     async def connect(self, protocol: asyncio.Protocol) -> RealmanTransport:
-        """Raises LinkDown."""
+        """Connect, ask for the generation, and make the port a Modbus master. Raises LinkDown."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
@@ -65,12 +70,12 @@ class RealmanLink:
                     lambda: RealmanTransport(protocol, self.address), self._host, self._tcp_port
                 )
         except OSError as error:
-            raise explain(self.address, error) from None
+            raise explain_connect_error(self.address, error) from None
         try:
-            dialect = codec.dialect(await self._who(arm), self._port)
+            dialect = codec.dialect(await self._ask_generation(arm), self._port)
             if self._volts is not None:
-                await self._done(arm, codec.set_voltage(self._volts), "does not switch the tool's voltage")
-            await self._done(arm, dialect.open_mode(self._baudrate, HAND_TIMEOUT), REFUSED_MODE.format(port=self._port))
+                await self._command(arm, codec.set_voltage(self._volts), "does not switch the tool's voltage")
+            await self._command(arm, dialect.open_mode(self._baudrate, HAND_TIMEOUT), MODE_REFUSED.format(port=self._port))
         except BaseException:
             arm.abort()
             raise
@@ -78,62 +83,64 @@ class RealmanLink:
         arm.begin(dialect)
         return arm
 
-    async def _who(self, arm: RealmanTransport) -> int:
-        """Its generation."""
-        for question in (codec.WHO, codec.WHO_2):
+    async def _ask_generation(self, arm: RealmanTransport) -> int:
+        for question in (codec.INFO, codec.VERSION):
             reply = await arm.call(question, codec.is_fence)
             if reply is not None:
-                found = codec.generation_of(reply) or 0
-                if self._generation not in (None, found):
-                    raise LinkDown(f"{self.address}: the arm is of generation {found}: take generation={self._generation} out")
-                return found
+                generation = codec.generation_of(reply) or 0
+                if self._generation not in (None, generation):
+                    raise LinkDown(
+                        f"{self.address}: the arm is of generation {generation}: take generation={self._generation} out"
+                    )
+                return generation
         raise LinkDown(f"{self.address} does not answer as a RealMan arm does: check host and port (usually 8080)")
 
-    async def _done(self, arm: RealmanTransport, step: Step, problem: str) -> None:
-        reply = await arm.call(step.message, step.answers)
-        if reply is None or step.words(reply) is None:
+    async def _command(self, arm: RealmanTransport, command: ArmCommand, problem: str) -> None:
+        reply = await arm.call(command.message, command.answers)
+        if reply is None or command.registers(reply) is None:
             raise LinkDown(f"{self.address}: the arm {problem}")
 
 
-REFUSED_MODE = (
+MODE_REFUSED = (
     "does not make port {port} a Modbus master: switch its gripper or hand mode off, unplug the teach pendant, "
     "and see that no other program has it"
 )
 
 
 class RealmanTransport(asyncio.Protocol):
-    """See `links.base.Transport`."""
+    """An open connection to an arm; see `links.base.Transport`."""
 
     def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
         self._protocol = protocol
         self._address = address
         self._loop = asyncio.get_running_loop()
-        self._lines = Lines()
+        self._lines = JsonLines()
         self._socket: asyncio.Transport | None = None
         self._error: LinkDown | None = LinkDown(f"{address} closed the connection: it is opened again")
         self._begun = False
         self._dialect = Dialect(2)
-        self._call: tuple[asyncio.Future[Message], Wanted] | None = None
-        """Who waits for one reply outside of questions, and what it has to be."""
+        self._call: tuple[asyncio.Future[Message], Accept] | None = None
+        """The caller of `call`, and which reply it accepts."""
         self._timer: asyncio.TimerHandle | None = None
-        # The question under way
-        self._question: Question | None = None
+        self._request: TunnelRequest | None = None
+        """The Modbus request in flight."""
         self._next: Frame | None = None
-        """What the engine said while the one before was still under way: that one is not wanted any more."""
-        self._step: Step | None = None
+        """A request that the engine sent while another one was in flight: it has given that one up."""
+        self._command: ArmCommand | None = None
+        """The command in flight; None while a fence is."""
         self._fencing = False
-        self._looks: set[tuple[str, int]] = set()
-        """Of answers since the last fence: another one of that look could be an old one."""
+        self._keys: set[tuple[str, int]] = set()
+        """Reply keys of the commands sent since the last fence."""
         self._failed: set[str] = set()
-        """Commands that failed since then: a no looks the same for any number of values."""
+        """Names of the commands that failed since then."""
 
     # Before the line is handed over
 
-    async def call(self, message: Message, wanted: Wanted) -> Message | None:
-        """Say it and return the first reply that `wanted` accepts; None: there was none in time."""
+    async def call(self, message: Message, accept: Accept) -> Message | None:
+        """Send a message and return the first reply that `accept` takes; None if there is none in time."""
         future: asyncio.Future[Message] = self._loop.create_future()
-        self._call = (future, wanted)
-        self._say(message)
+        self._call = (future, accept)
+        self._send(message)
         try:
             async with asyncio.timeout(ANSWER_TIMEOUT):
                 return await future
@@ -143,15 +150,15 @@ class RealmanTransport(asyncio.Protocol):
             self._call = None
 
     def begin(self, dialect: Dialect) -> None:
-        """From here on it is a line."""
+        """Hand the line to the protocol that was passed to `connect`."""
         self._dialect = dialect
         self._begun = True
-        self._protocol.connection_made(self)  # type: ignore[arg-type]  # a Transport by its methods, not by its base
+        self._protocol.connection_made(self)  # type: ignore[arg-type]  # has a transport's methods, but not its base class
 
     # The socket
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._socket = transport  # type: ignore[assignment]  # uvloop's is one by its methods only
+        self._socket = transport  # type: ignore[assignment]  # uvloop's transport has the methods, but not the base class
         for level, option, value in OPTIONS:
             transport.get_extra_info("socket").setsockopt(level, option, value)
 
@@ -165,84 +172,85 @@ class RealmanTransport(asyncio.Protocol):
             self._protocol.connection_lost(self._error)
 
     def data_received(self, data: bytes) -> None:
-        answer: bytes | None = None
+        """Pass the Modbus reply on after all lines of this chunk: none of them can answer what the engine sends next."""
+        reply: bytes | None = None
         for message in self._lines.feed(data):
             if self._call is not None:
-                future, wanted = self._call
-                if not future.done() and wanted(message):
+                future, accept = self._call
+                if not future.done() and accept(message):
                     future.set_result(message)
-            elif (told := self._heard(message)) is not None:
-                answer = told
-        if answer is not None:  # only now: what else came in one piece with it was no answer to what is asked next
-            self._protocol.data_received(answer)
+            else:
+                reply = self._on_message(message) or reply
+        if reply is not None:
+            self._protocol.data_received(reply)
 
-    # Questions
+    # Requests
 
     def write(self, data: bytes) -> None:
-        """One Modbus-RTU frame."""
+        """Take one Modbus-RTU frame. Ignores broadcasts and other bytes, which an arm cannot pass on."""
         reader = ModbusCodec("device")
         reader.receive_data(data)
         frame = reader.next_reply()
         if frame is None or frame.unit == BROADCAST or self.is_closing():
-            return  # an arm passes on questions to one unit each, and nothing else
-        if self._question is not None:
+            return
+        if self._request is not None:
             self._next = frame
             return
-        self._ask(frame)
+        self._begin_request(frame)
 
-    def _ask(self, frame: Frame) -> None:
-        self._question = Question(frame, self._dialect)
-        self._go_on()
+    def _begin_request(self, frame: Frame) -> None:
+        self._request = TunnelRequest(frame, self._dialect)
+        self._send_command()
 
-    def _go_on(self) -> None:
-        """The next command of the question, behind a fence where its answer could be an old one."""
-        assert self._question is not None
-        step = self._question.steps[0]
-        self._fencing = step.look in self._looks or step.answer in self._failed
+    def _send_command(self) -> None:
+        """Send the next command of the request, or a fence where its reply could be confused with an earlier one."""
+        assert self._request is not None
+        command = self._request.commands[0]
+        self._fencing = command.reply_key in self._keys or command.reply_name in self._failed
         if self._fencing:
-            self._step = None
-            self._say(codec.WHO if self._dialect.generation > 2 else codec.WHO_2)
+            self._command = None
+            self._send(codec.INFO if self._dialect.generation > 2 else codec.VERSION)
         else:
-            self._looks.add(step.look)
-            self._step = step
-            self._say(step.message)
+            self._keys.add(command.reply_key)
+            self._command = command
+            self._send(command.message)
         self._stop_timer()
-        self._timer = self._loop.call_later(ANSWER_TIMEOUT, self._silent)
+        self._timer = self._loop.call_later(ANSWER_TIMEOUT, self._on_silence)
 
-    def _heard(self, message: Message) -> bytes | None:
-        """One line of the arm. Returns the frame to hand over, when the question is answered with it."""
+    def _on_message(self, message: Message) -> bytes | None:
+        """Take one line of the arm. Returns the Modbus reply when it completes the request."""
         if self._fencing:
             if codec.is_fence(message):
-                self._looks.clear()
+                self._keys.clear()
                 self._failed.clear()
-                self._go_on()
+                self._send_command()
             return None
-        step, question = self._step, self._question
-        if step is None or question is None or not step.answers(message):
-            return None  # it speaks of itself, or says something twice
-        self._step = None
+        command, request = self._command, self._request
+        if command is None or request is None or not command.answers(message):
+            return None  # unsolicited, or a duplicate
+        self._command = None
         self._stop_timer()
-        found = step.words(message)
-        if found is None:
-            self._failed.add(step.answer)
-        told = question.take(found)
-        if question.steps and self._next is None:
-            self._go_on()
+        registers = command.registers(message)
+        if registers is None:
+            self._failed.add(command.reply_name)
+        reply = request.take(registers)
+        if request.commands and self._next is None:
+            self._send_command()
             return None
-        self._question = None
-        if self._next is not None:  # nobody waits for this answer any more
+        self._request = None
+        if self._next is not None:  # the engine has given this request up
             frame, self._next = self._next, None
-            self._ask(frame)
+            self._begin_request(frame)
             return None
-        return told
+        return reply
 
-    def _silent(self) -> None:
-        """No answer at all: whatever comes later on this socket could be taken for another one."""
-        self._lose(LinkDown(f"{self._address}: the arm does not answer: it is called again"))
+    def _on_silence(self) -> None:
+        """Close the connection: a reply that arrives on it from now on could be taken for another one."""
+        self._lose(LinkDown(f"{self._address}: the arm does not answer: the connection is opened again"))
 
     # The end
 
-    def _say(self, message: Message) -> None:
+    def _send(self, message: Message) -> None:
         if self._socket is not None:
             self._socket.write(codec.encode(message))
 
@@ -251,22 +259,22 @@ class RealmanTransport(asyncio.Protocol):
             self._timer.cancel()
 
     def poll_input(self) -> bool:
-        """The loop reads the socket."""
+        """Return False: only the loop can read the socket."""
         return False
 
     def set_baudrate(self, baudrate: int) -> None:
-        """Never called: the traits say that it cannot."""
+        """Do nothing: the traits of this link do not allow a change."""
 
     def is_closing(self) -> bool:
         return self._socket is None or self._socket.is_closing()
 
     def close(self) -> None:
-        """Give the port back to the arm, then leave."""
-        step = self._dialect.close_mode() if self._begun else None
+        """Give the port back to the arm, then close."""
+        command = self._dialect.close_mode() if self._begun else None
         self._error = None
         self._stop_timer()
-        if step is not None and not self.is_closing():
-            self._say(step.message)
+        if command is not None and not self.is_closing():
+            self._send(command.message)
         if self._socket is not None:
             self._socket.close()
 

@@ -1,7 +1,7 @@
-"""A serial port: pyserial opens and configures it, pyserial-asyncio's transport owns its life.
+"""A serial port: pyserial opens and configures it, and pyserial-asyncio's transport owns its life.
 
-The transport is a subclass that reads and writes the descriptor directly, which costs a third of going through pyserial, and that
-never waits for a port: a loop serves several buses, and none may stop for another.
+`DirectTransport` is a subclass that reads and writes the file descriptor itself, because going through pyserial costs three times
+as much. It never waits for the port: one loop serves several buses, and a slow port must not delay the others.
 """
 
 from __future__ import annotations
@@ -18,65 +18,70 @@ import serial.rs485
 from serial_asyncio import SerialTransport
 
 from servobus.errors import LinkDown
-from servobus.links.tty import check_device, explain, is_pty
+from servobus.links.tty import check_device, explain_open_error, is_pty
 from servobus.protocols.base import LineTraits
 
 CHUNK = 4096
 MAX_UNSENT = 64 * 1024
-"""Bytes that may wait for room in the kernel's buffer; a port that takes none for so long is gone."""
+"""Bytes that may wait for space in the kernel's buffer. The port counts as gone when more wait."""
 USB_LATENCY = 0.002
-"""Seconds an adapter may sit on a reply. FTDI's own default is 16 ms, and low latency mode (asked for at open) makes it 1."""
+"""Seconds an adapter may keep a reply. FTDI's default is 16 ms; low latency mode, which is requested at open, makes it 1 ms."""
 UART_LATENCY = 0.001
 ADAPTER_MARGIN = 0.002
-"""Seconds after which an adapter has passed on what the kernel gave it."""
+"""Seconds an adapter needs to send on what the kernel gave it."""
 USB_NAMES = ("ttyUSB", "ttyACM")
 GONE = "was unplugged, or its other end closed: it is opened again when it is back"
 
 
 class SerialLink:
-    """See `links.base.Link`. `rs485`: the kernel switches the transmitter, where the driver can."""
+    """A device file; see `links.base.Link`."""
 
     def __init__(self, port: str, baudrate: int, *, rs485: bool = False) -> None:
+        """`rs485`: let the kernel switch the transmitter, where the port's driver can."""
         self.address = port
         self._baudrate = baudrate
         self._rs485 = rs485
 
     @property
     def traits(self) -> LineTraits:
-        """A PTY has no wire, so what is heard early on it may be an answer; its rate still tells how long one may take."""
+        """The line's traits. Bytes on a PTY take no time on a wire, so a reply may arrive early there; deadlines still use the
+        rate."""
         if is_pty(self.address):
             return LineTraits(self._baudrate, can_change_baud=True)
         usb = os.path.basename(os.path.realpath(self.address)).startswith(USB_NAMES)
         return LineTraits(self._baudrate, paced=True, latency=USB_LATENCY if usb else UART_LATENCY, can_change_baud=True)
 
     async def connect(self, protocol: asyncio.Protocol) -> DirectTransport:
-        """Raises PortMissing, PortBusy, PortDenied, LinkDown."""
+        """Open the port. Raises PortMissing, PortBusy, PortDenied, LinkDown."""
         check_device(self.address)
         loop = asyncio.get_running_loop()
-        # A USB adapter that hangs keeps whoever opens it for seconds, so a thread waits for it.
-        opening = loop.run_in_executor(None, self._open)
+        # A USB adapter that hangs blocks open() for seconds, so a thread does it.
+        pending_port = loop.run_in_executor(None, self._open)
         try:
-            port = await asyncio.shield(opening)
+            port = await asyncio.shield(pending_port)
         except asyncio.CancelledError:
-            opening.add_done_callback(_close_again)
+            pending_port.add_done_callback(_close_unwanted)
             raise
         transport = DirectTransport(loop, protocol, port)
         try:
-            await asyncio.sleep(0)  # behind connection_made and the reader, which the base has queued
+            await asyncio.sleep(0)  # the base class has queued connection_made and the reader: let them run first
         except asyncio.CancelledError:
             transport.abort()
             raise
         return transport
 
     def _open(self) -> serial.Serial:
-        """Linux raises DTR and RTS whenever a port is opened, pyserial says the same once more, and nothing here touches them
-        afterwards: there is no edge that could reset a board or switch a transmitter. What came before is thrown away."""
+        """Open and configure the port; discards what arrived before.
+
+        Linux raises DTR and RTS when a port is opened, pyserial raises them again, and servobus does not change them afterwards.
+        So there is no edge that could reset a board or switch a transmitter.
+        """
         try:
-            # An inter-byte timeout makes pyserial set VMIN to 1: then a read that finds nothing says so, and only a hang-up reads
-            # as empty.
+            # With an inter-byte timeout pyserial sets VMIN to 1. Then a read without data raises BlockingIOError, and an empty
+            # read means a hang-up.
             port = serial.Serial(self.address, self._baudrate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            raise explain(self.address, error) from None
+            raise explain_open_error(self.address, error) from None
         try:
             if self._rs485:
                 port.rs485_mode = serial.rs485.RS485Settings()
@@ -91,7 +96,7 @@ class SerialLink:
 
 
 class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asyncio publishes no types
-    """See `links.base.Transport`."""
+    """An open port; see `links.base.Transport`."""
 
     _has_writer: bool
 
@@ -99,48 +104,50 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
         self._port = port
         self._descriptor = port.fileno()
         self._unsent = b""
-        self._held: bytes | None = None
-        """Written since another baud rate was asked for, while the line still speaks at the old one."""
+        self._deferred: bytes | None = None
+        """Bytes to send after a change of rate; None while no change is pending."""
         self._rate: int = port.baudrate
-        self._said_by = 0.0
-        """When the line will have said all that was written."""
-        self._aborted = self._told = False
+        self._busy_until = 0.0
+        """Monotonic time at which the line will have sent everything that was written."""
+        self._aborted = self._ended = False
         super().__init__(loop, protocol, port)
 
     def write(self, data: bytes) -> None:
-        """At once, as far as there is room; the rest when there is."""
+        """Write as much as the kernel takes now; the rest follows when there is space."""
         if self._closing:
             return
-        if self._held is None:
-            self._say(data)
+        if self._deferred is None:
+            self._send(data)
         else:
-            self._held += data
+            self._deferred += data
         if self.get_write_buffer_size() > MAX_UNSENT:
             self._lose(OSError(errno.ENOBUFS, "it takes no more bytes"))
 
     def poll_input(self) -> bool:
-        """Read what is there now."""
+        """Read what has arrived."""
         if not self._closing:
             self._read_ready()
         return True
 
     def set_baudrate(self, baudrate: int) -> None:
-        """As soon as the line has said what was written; what is written from now on follows at the new rate. `tcdrain` would
-        wait for that too, but it would stop the whole loop, and it does not know what an adapter still holds."""
+        """Change the rate when everything written so far is sent; later writes follow at the new rate.
+
+        `tcdrain` would wait for that too, but it would block the loop, and it does not see what an adapter still keeps.
+        """
         self._rate = baudrate
-        if self._held is None:
-            self._held = b""
+        if self._deferred is None:
+            self._deferred = b""
             self._change_rate()
 
     def get_write_buffer_size(self) -> int:
-        """Bytes that the kernel was not given yet."""
-        return len(self._unsent) + len(self._held or b"")
+        """Return the bytes that the kernel has not taken yet."""
+        return len(self._unsent) + len(self._deferred or b"")
 
-    def _say(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         now = time.monotonic()
-        if self._said_by < now:
-            self._said_by = now
-        self._said_by += len(data) * 10 / self._rate
+        if self._busy_until < now:
+            self._busy_until = now
+        self._busy_until += len(data) * 10 / self._rate
         if not self._unsent:
             try:
                 data = data[os.write(self._descriptor, data) :]
@@ -156,10 +163,10 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
                 self._has_writer = True
 
     def _change_rate(self) -> None:
-        """Or come back when the line has fallen silent."""
-        if self._told:
+        """Change the rate, or try again when the line is silent."""
+        if self._ended:
             return
-        wait = self._said_by + ADAPTER_MARGIN - time.monotonic()
+        wait = self._busy_until + ADAPTER_MARGIN - time.monotonic()
         if wait > 0 or self._unsent:
             self._loop.call_later(max(wait, ADAPTER_MARGIN), self._change_rate)
             return
@@ -168,9 +175,9 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
         except (OSError, ValueError, termios.error) as error:
             self._lose(error)
             return
-        held, self._held = self._held, None
-        if held:
-            self._say(held)
+        deferred, self._deferred = self._deferred, None
+        if deferred:
+            self._send(deferred)
         if self._closing:
             self._close()
 
@@ -201,27 +208,28 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
                 self._close()
 
     def _lose(self, error: Exception) -> None:
-        """The port is gone. Whoever was leaving anyway has left."""
+        """End the connection because the port is gone; without an error if it was closing anyway."""
         reason = getattr(error, "strerror", None) or error
         self._abort(None if self._closing else LinkDown(f"{self._port.name} {GONE} ({reason})"))
 
     def _close(self, exc: Exception | None = None) -> None:
-        """When the line has said everything: a port that is closed before keeps the loop waiting for it."""
+        """Close once the line has sent everything: closing a port earlier blocks the loop until it has."""
         self._closing = True
         self._remove_reader()
-        if not self._unsent and self._held is None:
+        if not self._unsent and self._deferred is None:
             self._remove_writer()
-            self._loop.call_later(max(0.0, self._said_by - time.monotonic()), self._call_connection_lost, exc)
+            self._loop.call_later(max(0.0, self._busy_until - time.monotonic()), self._call_connection_lost, exc)
 
     def _abort(self, exc: Exception | None) -> None:
         self._aborted = True
         super()._abort(exc)
 
     def _call_connection_lost(self, exc: Exception | None) -> None:
-        """Once. Not the base's: that drains the port, which never ends when the other side takes nothing."""
-        if self._told:
+        """Report the end once. Replaces the base class's method, which drains the port and blocks when the other side reads
+        nothing."""
+        if self._ended:
             return
-        self._told = True
+        self._ended = True
         with suppress(termios.error, OSError):
             if self._aborted or self._port.out_waiting:
                 self._port.reset_output_buffer()
@@ -230,7 +238,7 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
         self._protocol.connection_lost(exc)
 
 
-def _close_again(opening: asyncio.Future[serial.Serial]) -> None:
-    """Nobody waits for this port any more."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()
+def _close_unwanted(port: asyncio.Future[serial.Serial]) -> None:
+    """Close a port that was opened after its caller had given up."""
+    if not port.cancelled() and port.exception() is None:
+        port.result().close()

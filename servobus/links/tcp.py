@@ -1,4 +1,4 @@
-"""Raw bytes over TCP: a serial device server, or ser2net."""
+"""Raw bytes over TCP, to a serial device server or ser2net."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from servobus.protocols.base import LineTraits
 
 CONNECT_TIMEOUT = 2.0
 LATENCY = 0.020
-"""Seconds a server may collect bytes before it sends them on."""
+"""Seconds a server may collect bytes before it passes them on."""
 MAX_UNSENT = 64 * 1024
-"""Bytes that may wait for the server; one that takes none for so long is gone."""
+"""Bytes that may wait for the server. It counts as gone when more wait."""
 OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
     (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
@@ -24,36 +24,37 @@ OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1),
     (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
 )
-"""No byte waits for another, and a server that is gone without a word is noticed within 8 s, even if nothing is asked of it."""
+"""Send each byte at once, and notice within 8 s that the server has disappeared, even if the line is idle."""
 REASONS = {
-    errno.ECONNREFUSED: "nobody listens there: check the port number, and whether the server is on",
-    errno.EHOSTUNREACH: "no way leads there: check the address and the cable",
-    errno.ENETUNREACH: "no way leads there: check the address and this machine's network",
+    errno.ECONNREFUSED: "no program listens there: check the port number, and whether the server is on",
+    errno.EHOSTUNREACH: "there is no route to it: check the address and the cable",
+    errno.ENETUNREACH: "there is no route to it: check the address and this machine's network",
 }
 
 
 class TcpLink:
-    """See `links.base.Link`. `baudrate`: what the server speaks on its line, for deadlines; it is set at the server."""
+    """A TCP address; see `links.base.Link`."""
 
     def __init__(self, host: str, port: int, baudrate: int) -> None:
+        """`baudrate`: the rate that is set at the server. Deadlines use it; it is not sent to the server."""
         self.address = f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
         self.traits = LineTraits(baudrate, latency=LATENCY)
         self._host = host
         self._port = port
 
     async def connect(self, protocol: asyncio.Protocol) -> TcpTransport:
-        """Raises LinkDown."""
+        """Connect to the server. Raises LinkDown."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 _, adapter = await loop.create_connection(partial(TcpTransport, protocol, self.address), self._host, self._port)
         except OSError as error:
-            raise explain(self.address, error) from None
+            raise explain_connect_error(self.address, error) from None
         return adapter
 
 
-def explain(address: str, error: OSError) -> LinkDown:
-    """What the system's error means, and what to do about it."""
+def explain_connect_error(address: str, error: OSError) -> LinkDown:
+    """Return an error that says what the system's error means and what to do."""
     if isinstance(error, TimeoutError):
         return LinkDown(f"{address} does not answer: check the address, and whether the server is on")
     if isinstance(error, socket.gaierror):
@@ -65,22 +66,22 @@ def explain(address: str, error: OSError) -> LinkDown:
 
 
 class TcpTransport(asyncio.Protocol):
-    """See `links.base.Transport`: the socket's transport with the methods it lacks, and its errors in our words."""
+    """An open connection; see `links.base.Transport`. Adds to the socket's transport what it lacks, and translates its errors."""
 
     def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
         self._protocol = protocol
         self._address = address
         self._error: LinkDown | None = LinkDown(f"{address} closed the connection: it is opened again")
-        """What to say when the connection ends."""
+        """The error to report when the connection ends."""
         self._socket: asyncio.Transport
-        # No detour for what is heard. Here and not later: uvloop looks it up before it reports the connection.
+        # Saves one call per chunk. It is set here because uvloop reads the attribute before it calls connection_made.
         self.data_received = protocol.data_received  # type: ignore[method-assign]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._socket = cast("asyncio.Transport", transport)  # uvloop's is one by its methods only
+        self._socket = cast("asyncio.Transport", transport)  # uvloop's transport has the methods, but not the base class
         for level, option, value in OPTIONS:
             transport.get_extra_info("socket").setsockopt(level, option, value)
-        self._protocol.connection_made(self)  # type: ignore[arg-type]  # a Transport by its methods, not by its base
+        self._protocol.connection_made(self)  # type: ignore[arg-type]  # has a transport's methods, but not its base class
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._error is not None and exc is not None:
@@ -96,11 +97,11 @@ class TcpTransport(asyncio.Protocol):
             self._socket.abort()
 
     def poll_input(self) -> bool:
-        """The loop reads the socket."""
+        """Return False: only the loop can read the socket."""
         return False
 
     def set_baudrate(self, baudrate: int) -> None:
-        """Never called: the traits say that it cannot."""
+        """Do nothing: the traits of this link do not allow a change."""
 
     def is_closing(self) -> bool:
         return self._socket.is_closing()

@@ -1,4 +1,4 @@
-"""What the system says of a device file: whether it is a port, who holds it, and why it cannot be opened."""
+"""Device files of serial ports: whether a path is one, which process has it open, and why it cannot be opened."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KINDS = {stat.S_IFDIR: "a directory", stat.S_IFREG: "a regular file", stat.S_IFI
 
 
 def is_pty(path: str) -> bool:
-    """A terminal without a wire."""
+    """Return whether the path is a pseudo terminal, which has no wire."""
     try:
         return os.major(os.stat(path).st_rdev) in PTY_MAJORS
     except OSError:
@@ -24,50 +24,52 @@ def is_pty(path: str) -> bool:
 
 
 def check_device(path: str) -> None:
-    """Raises PortMissing for what can be no serial port, PortDenied for what cannot even be looked at; opens nothing."""
+    """Check, without opening it, that a path can be a serial port. Raises PortMissing, PortDenied."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
         raise PortMissing(f"{path} does not exist: plug the adapter in, or choose one that `servobus ports` shows") from None
     except OSError as error:
-        raise explain(path, error) from None
+        raise explain_open_error(path, error) from None
     if not stat.S_ISCHR(mode):
         kind = KINDS.get(stat.S_IFMT(mode), "no character device")
-        raise PortMissing(f"{path} is {kind} and no serial port: choose one that `servobus ports` shows")
+        raise PortMissing(f"{path} is {kind}, not a serial port: choose one that `servobus ports` shows")
 
 
-def explain(path: str, error: Exception) -> LinkDown:
-    """What the system's error means, and what to do about it."""
-    code = _code(error)
+def explain_open_error(path: str, error: Exception) -> LinkDown:
+    """Return an error that says what the system's error means and what to do."""
+    code = _error_number(error)
     if code in REASONS:
         return REASONS[code](path)
     return LinkDown(f"{path} cannot be opened ({error}): unplug it and plug it in again, then try `servobus ports`")
 
 
 def find_holder(path: str) -> tuple[int, str] | None:
-    """The process that has locked this device, or else has it open, and its name, as far as this user may see; another one rather
-    than this one."""
+    """Return process id and name of the program that has locked a device, else of one that has it open.
+
+    Other processes are preferred to this one. None where there is none, or this user may not see it.
+    """
     try:
-        wanted = os.stat(path)
+        status = os.stat(path)
     except OSError:
         return None
     own = os.getpid()
-    locked = _locked_by(wanted)
+    lockers = _locked_by(status)
     processes = [int(folder.name) for folder in Path("/proc").glob("[0-9]*")]
-    for pid in sorted(processes, key=lambda pid: (pid not in locked, pid == own, pid)):
-        if any(os.path.samestat(wanted, found) for found in _open_files(pid)):
+    for pid in sorted(processes, key=lambda pid: (pid not in lockers, pid == own, pid)):
+        if any(os.path.samestat(status, other) for other in _open_files(pid)):
             return pid, _name(pid)
     return None
 
 
-def _locked_by(wanted: os.stat_result) -> set[int]:
-    """Processes with a lock on this file: `1: FLOCK ADVISORY WRITE 4711 00:1c:3 0 EOF` names device and inode."""
-    place = f"{os.major(wanted.st_dev):02x}:{os.minor(wanted.st_dev):02x}:{wanted.st_ino}"
+def _locked_by(status: os.stat_result) -> set[int]:
+    """Return the processes that have locked this file. `1: FLOCK ADVISORY WRITE 4711 00:1c:3 0 EOF` names device and inode."""
+    inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     try:
         lines = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
     except OSError:
         return set()
-    return {int(words[-4]) for words in lines if len(words) >= 8 and words[-3] == place}
+    return {int(columns[-4]) for columns in lines if len(columns) >= 8 and columns[-3] == inode}
 
 
 def _open_files(pid: int) -> Iterator[os.stat_result]:
@@ -79,7 +81,7 @@ def _open_files(pid: int) -> Iterator[os.stat_result]:
                 except OSError:
                     continue  # closed meanwhile
     except OSError:
-        return  # ended meanwhile, or another user's
+        return  # the process has ended, or belongs to another user
 
 
 def _name(pid: int) -> str:
@@ -92,15 +94,15 @@ def _name(pid: int) -> str:
 def _busy(path: str) -> LinkDown:
     holder = find_holder(path)
     if holder is None:
-        return PortBusy(f"{path} is held by a process of another user: `sudo fuser -v {path}` names it; end it first")
+        return PortBusy(f"{path} is open in a process of another user: `sudo fuser -v {path}` names it; end it first")
     pid, name = holder
     if pid == os.getpid():
         return PortBusy(f"{path} is open already in this process ({pid}, {name}): close it there first")
-    return PortBusy(f"{path} is held by process {pid} ({name}): end that first, or let it do the work")
+    return PortBusy(f"{path} is open in process {pid} ({name}): end that first, or use the port through it")
 
 
 def _denied(path: str) -> LinkDown:
-    """A group that may is joined; where there is none, or it is root's, a rule has to make one."""
+    """If the device's group may open it, tell the user to join the group; otherwise suggest a udev rule."""
     try:
         status = os.stat(path)
         shared = status.st_gid != 0 and status.st_mode & 0o060 == 0o060
@@ -115,10 +117,10 @@ def _denied(path: str) -> LinkDown:
     return PortDenied(f"{path} may not be opened by you, nor by its group ({group}): {advice}")
 
 
-def _walled_off(path: str) -> LinkDown:
-    """The file's own permissions do not say this, but the walls around a container or a service do."""
+def _not_permitted(path: str) -> LinkDown:
+    """The file's permissions allow it, but the device rules of a container or service do not."""
     advice = f"start the container with `--device {path}`, or the service with `DeviceAllow={path}`"
-    return PortDenied(f"{path} is kept from this container or service: {advice}")
+    return PortDenied(f"{path} is not passed to this container or service: {advice}")
 
 
 def _gone(path: str) -> LinkDown:
@@ -126,25 +128,25 @@ def _gone(path: str) -> LinkDown:
 
 
 def _no_port(path: str) -> LinkDown:
-    return PortMissing(f"{path} is a device, but no serial port: choose one that `servobus ports` shows")
+    return PortMissing(f"{path} is a device, but not a serial port: choose one that `servobus ports` shows")
 
 
 REASONS: dict[int, Callable[[str], LinkDown]] = {
     errno.EACCES: _denied,
-    errno.EPERM: _walled_off,
+    errno.EPERM: _not_permitted,
     errno.EBUSY: _busy,
     errno.EAGAIN: _busy,  # pyserial's lock
     errno.ENOENT: _gone,
     errno.ENXIO: _gone,
     errno.ENODEV: _gone,
-    errno.EIO: _gone,  # a port that the kernel knows, and no hardware
+    errno.EIO: _gone,  # the kernel has the port, but there is no hardware
     errno.ENOTTY: _no_port,
     errno.EINVAL: _no_port,
 }
 
 
-def _code(error: BaseException | None) -> int:
-    """The system's error number. pyserial wraps some errors without it, and those of termios have no name for it."""
+def _error_number(error: BaseException | None) -> int:
+    """Return the system's error number. Some errors of pyserial wrap it, and those of termios keep it in `args`."""
     while error is not None:
         number = getattr(error, "errno", None) or next(iter(error.args), None)
         if isinstance(number, int):

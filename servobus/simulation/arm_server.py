@@ -13,38 +13,38 @@ from servobus.protocols.base import Device
 from servobus.protocols.modbus.codec import ModbusCodec
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
-from servobus.protocols.realman.codec import Lines, Message, encode
+from servobus.protocols.realman.codec import JsonLines, Message, encode
 from servobus.protocols.realman.simulated.arm import SimulatedArm
 from servobus.protocols.registry import PROTOCOLS
 from servobus.timers import clock_of
 
 SCHEME = "realman"
 LATENCY = 0.002
-"""Seconds of one command, beside what the hand takes."""
+"""Seconds the arm takes for one command, in addition to the hand's time."""
 CHATTER: Message = {
     "state": "current_trajectory_state",
     "trajectory_state": True,
     "device": 0,
     "trajectory_connect": 1,
 }
-"""What an arm says unasked."""
+"""A line that an arm sends unsolicited."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmFaults:
-    """How bad the connection is; shares of all replies, 0 to 1."""
+    """The share of replies, 0 to 1, that each fault hits."""
 
     duplicate: float = 0.0
-    """Said twice."""
+    """The reply is sent twice."""
     late: float = 0.0
-    """Said `late_s` too late; those behind wait."""
+    """The reply is sent `late_s` seconds too late, and those after it wait."""
     late_s: float = 0.0
     split: float = 0.0
-    """Delivered in two pieces."""
+    """The reply arrives in two pieces."""
     cut: float = 0.0
-    """Their end is lost, and the next line stands behind them."""
+    """The end of the reply is lost, and the next line follows directly."""
     chatter: float = 0.0
-    """Behind a line that nobody asked for."""
+    """An unsolicited line precedes the reply."""
     drop: float = 0.0
     """The connection ends instead."""
     seed: int = 0
@@ -88,7 +88,7 @@ class ArmServer:
         try:
             await self._serve(reader, writer)
         except (OSError, asyncio.CancelledError):
-            pass  # the client, or the server, is gone
+            pass  # the client or the server has gone
         finally:
             self._clients.discard(task)
             writer.close()
@@ -96,29 +96,29 @@ class ArmServer:
                 await writer.wait_closed()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        lines = Lines()
+        lines = JsonLines()
         while data := await reader.read(4096):
             for message in lines.feed(data):
                 self._delay = LATENCY
                 reply = self.arm.handle(message)
                 await asyncio.sleep(self._delay)
-                if reply is not None and not await self._say(writer, encode(reply)):
+                if reply is not None and not await self._send(writer, encode(reply)):
                     return
 
-    async def _say(self, writer: asyncio.StreamWriter, line: bytes) -> bool:
-        """With its faults; False: the connection has ended."""
-        hit = self._hit
-        if hit(self.faults.drop):
+    async def _send(self, writer: asyncio.StreamWriter, line: bytes) -> bool:
+        """Send a line with its faults. Returns False when the connection is to end."""
+        hits = self._hits
+        if hits(self.faults.drop):
             return False
-        if hit(self.faults.late):
+        if hits(self.faults.late):
             await asyncio.sleep(self.faults.late_s)
-        if hit(self.faults.chatter):
+        if hits(self.faults.chatter):
             line = encode(CHATTER) + line
-        if hit(self.faults.cut):
+        if hits(self.faults.cut):
             line = line[: -self._rng.randrange(1, len(line))]
-        if hit(self.faults.duplicate):
+        if hits(self.faults.duplicate):
             line += line
-        if hit(self.faults.split):
+        if hits(self.faults.split):
             middle = self._rng.randrange(1, len(line))
             writer.write(line[:middle])
             await writer.drain()
@@ -128,26 +128,27 @@ class ArmServer:
         await writer.drain()
         return True
 
-    def _hit(self, share: float) -> bool:
+    def _hits(self, share: float) -> bool:
         return share > 0 and self._rng.random() < share
 
-    def _exchange(self, question: bytes) -> bytes | None:
+    def _exchange(self, request: bytes) -> bytes | None:
         codec = ModbusCodec("device")
-        codec.receive_data(question)
+        codec.receive_data(request)
         frame = codec.next_reply()
         replies = [reply for device in self.devices for reply in device.handle(frame, self._now())] if frame else []
         if len(replies) != 1:
-            return None  # nobody there, or two at once
+            return None  # no unit answers, or two answer at once
         self._delay += replies[0].delay + replies[0].late
         return replies[0].data
 
 
 def is_arm(port: str) -> bool:
+    """Return whether a config's `port` is the address of an arm."""
     return port.startswith(f"{SCHEME}:")
 
 
 def arm_server(options: BusOptions, models: Mapping[str, ServoModel]) -> ArmServer:
-    """The hands of a bus behind an arm of the generation that its `port` names; 3, if it names none."""
+    """Return the hands of a bus behind an arm. Its generation is that of the bus's `port`, or 3."""
     keys = parse_qs(urlsplit(options.port).query)
     generation = int(keys.get("generation", ["3"])[0])
     devices = list(PROTOCOLS[options.protocol].devices(options, models))
@@ -155,5 +156,5 @@ def arm_server(options: BusOptions, models: Mapping[str, ServoModel]) -> ArmServ
 
 
 def address(options: BusOptions, server: ArmServer) -> str:
-    """What to write as `port` to reach it."""
+    """Return the `port` with which a config reaches the server."""
     return urlsplit(options.port)._replace(netloc=f"127.0.0.1:{server.port}").geturl()

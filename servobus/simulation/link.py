@@ -1,6 +1,6 @@
-"""From the options of a bus to its simulated line, and to a link that ends there.
+"""Links to simulated lines, made from the options of a bus.
 
-`port: "sim:"` is a line whose bytes take their time, `port: "sim:?wire_time=off"` one whose bytes take none.
+`port: "sim:"` is a line on which bytes take their wire time; with `port: "sim:?wire_time=off"` they take none.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from servobus.simulation.line import SimulatedLine
 
 SIMULATED = "sim:"
 PORTS = {"sim:": True, "sim:?wire_time=off": False}
-"""What a simulated port may be called, and whether bytes take time there."""
+"""Address of a simulated line -> whether bytes take their wire time on it."""
 
 
 def has_wire_time(port: str) -> bool:
-    """Raises ConfigError for what is no simulated port."""
+    """Return whether bytes take their wire time. Raises ConfigError for another address."""
     try:
         return PORTS[port]
     except KeyError:
-        known = " or ".join(f'"{form}"' for form in PORTS)
-        raise ConfigError(f"port {port!r} is no simulated line: write {known}") from None
+        forms = " or ".join(f'"{form}"' for form in PORTS)
+        raise ConfigError(f"port {port!r} is not a simulated line: write {forms}") from None
 
 
 def simulated_line(
     options: BusOptions, models: Mapping[str, ServoModel], loop: asyncio.AbstractEventLoop, *, wire_time: bool = True
 ) -> SimulatedLine:
-    """The servos of a bus, each standing at its zero."""
-    entry = PROTOCOLS[options.protocol]
-    devices = entry.devices(options, models)
+    """Return a line with the servos of a bus, each at its zero position."""
+    protocol = PROTOCOLS[options.protocol]
+    devices = protocol.devices(options, models)
     return SimulatedLine(
         devices,
-        entry.device_codec(options),
+        protocol.device_codec(options),
         loop,
         baudrate=options.baudrate,
         wire_time=wire_time,
@@ -49,15 +49,15 @@ def simulated_line(
 
 
 def far_end(options: BusOptions, line: SimulatedLine, loop: asyncio.AbstractEventLoop) -> FarEnd:
-    """The line as its master meets it: behind the fault injector where the options want one."""
+    """Return the line, behind a fault injector if the options ask for one."""
     if options.faults is None:
         return line
-    entry = PROTOCOLS[options.protocol]
-    return FaultyEnd(line, options.faults, loop, rename=entry.rename, node_of=entry.node_of)
+    protocol = PROTOCOLS[options.protocol]
+    return FaultyEnd(line, options.faults, loop, rename=protocol.rename, node_of=protocol.node_of)
 
 
 class SimulatedLink(MemoryLink):
-    """A link to a simulated line. The line, and with it what its servos know, outlives every connection."""
+    """A link to a simulated line. The line and the state of its servos outlive each connection."""
 
     def __init__(self, far: FarEnd, traits: LineTraits, address: str, line: SimulatedLine) -> None:
         super().__init__(far, traits, address)
@@ -65,22 +65,25 @@ class SimulatedLink(MemoryLink):
         self._baudrate = line.baudrate
 
     async def connect(self, protocol: asyncio.Protocol) -> MemoryTransport:
-        """Like a port, it is opened at the rate of the config, whatever rate was tried before."""
+        """Open the line at the rate of the config, as a serial port is opened, whatever rate was set before."""
         transport = await super().connect(protocol)
         self.line.set_baudrate(self._baudrate)
         return transport
 
     def close(self) -> None:
-        """For good: nothing is said on this line any more."""
+        """End the line for good."""
         self.line.close()
 
 
 def simulated_link(options: BusOptions, models: Mapping[str, ServoModel], *, wire_time: bool = True) -> SimulatedLink:
-    """To be called where a loop runs. `wire_time=False`: bytes take no time, whatever the port says. Raises ConfigError."""
+    """Return a link to a new simulated line. Call it in a running loop.
+
+    `wire_time=False`: bytes take no time, whatever the port says. Raises ConfigError for a port that is not simulated.
+    """
     loop = asyncio.get_running_loop()
     wire_time = has_wire_time(options.port) and wire_time
     line = simulated_line(options, models, loop, wire_time=wire_time)
-    # An echo comes from the injector, which keeps no wire time.
+    # The fault injector makes the echo, and it does not keep wire time.
     early = options.faults is not None and options.faults.echo > 0
     traits = LineTraits(options.baudrate if wire_time else None, paced=wire_time and not early, can_change_baud=True)
     return SimulatedLink(far_end(options, line, loop), traits, options.port, line)

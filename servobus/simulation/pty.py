@@ -1,7 +1,7 @@
 """A simulated line as a serial port that any program can open: a PTY.
 
-A PTY has no baud rate of its own, but it keeps the one its user set; the far end is told before it hears anything. The slave is
-held open, so users may come and go; closing the whole is what pulling the plug looks like to them.
+A PTY has no baud rate of its own, but it keeps the one its user set; the line is told that rate before each chunk. This process
+keeps the slave side open, so users may come and go. Closing the PTY looks to them like a pulled plug.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from servobus.links.base import FarEnd
 
 TCGETS2 = 0x802C542A
 TERMIOS2 = struct.Struct("4I B 19B 2I")
-"""struct termios2: it tells custom rates too, which termios cannot. The last field is the output speed."""
+"""struct termios2, which also has custom rates; termios does not. Its last field is the output speed."""
 CHUNK = 4096
 FULL, HALF = 0.1, 0.05
-"""Seconds of unsaid bytes at which it stops reading, and goes on. What it does not read fills the system's buffer, and then its
-user waits, as with a UART."""
+"""Seconds of unsent bytes at which it stops reading, and at which it reads again. Unread bytes fill the system's buffer, and then
+the user's writes wait, as with a UART."""
 
 
 class SimulatedPty:
-    """Open from the start. `path` is what a user opens: the link if one was asked for."""
+    """A PTY in front of a line, open from the start. `path` is what a user opens: the symlink, if one was asked for."""
 
     def __init__(
         self,
@@ -37,9 +37,9 @@ class SimulatedPty:
         backlog: Callable[[], float] = float,
         symlink: Path | None = None,
     ) -> None:
-        """`backlog` tells how many seconds the line needs to say what it was given."""
+        """Open a PTY. `backlog`: returns the seconds that the line needs to send what it was given."""
         self.dropped = 0
-        """Bytes that nobody read, so that there was no room for them."""
+        """Bytes that were lost because no user read them and the buffer was full."""
         self._far = far
         self._loop = loop
         self._backlog = backlog
@@ -61,7 +61,7 @@ class SimulatedPty:
         return str(self._symlink or self._device)
 
     def close(self) -> None:
-        """Pull the plug: whoever has it open gets an error. The link goes too, unless it leads elsewhere by now."""
+        """Pull the plug: a user gets an error. Removes the symlink, unless it leads elsewhere by now."""
         if self._master < 0:
             return
         self._loop.remove_reader(self._master)
@@ -70,27 +70,27 @@ class SimulatedPty:
         self._close_descriptors()
 
     def baudrate(self) -> int:
-        """As the user set it last."""
+        """Return the rate that its user set last."""
         speed: int = TERMIOS2.unpack(fcntl.ioctl(self._slave, TCGETS2, bytes(TERMIOS2.size)))[-1]
         return speed
 
     def _read(self) -> None:
         data = os.read(self._master, CHUNK)
-        # A user's claim outlives the user, as the slave stays open: without this nobody else but root could open it.
+        # A user's TIOCEXCL outlives the user, because the slave stays open here. Without this, only root could open it again.
         fcntl.ioctl(self._slave, termios.TIOCNXCL)
-        if speed := self.baudrate():  # 0 hangs up
+        if speed := self.baudrate():  # 0 means hang up
             self._far.set_baudrate(speed)
         self._far.receive(data)
-        if (unsaid := self._backlog()) > FULL:
+        if (backlog := self._backlog()) > FULL:
             self._loop.remove_reader(self._master)
-            self._loop.call_later(unsaid - HALF, self._go_on)
+            self._loop.call_later(backlog - HALF, self._resume)
 
-    def _go_on(self) -> None:
+    def _resume(self) -> None:
         if self._master >= 0:
             self._loop.add_reader(self._master, self._read)
 
     def _write(self, data: bytes) -> None:
-        """A UART waits for nobody: what finds no room is lost, and counted."""
+        """Write what there is space for; the rest is lost and counted, as with a UART."""
         if self._master < 0:
             return
         try:
@@ -100,14 +100,14 @@ class SimulatedPty:
         self.dropped += len(data) - written
 
     def _publish(self) -> None:
-        """Let the link lead here at once; only another link is replaced, never a file."""
+        """Make the symlink atomically. Replaces another symlink, but never a file."""
         if self._symlink is None:
             return
         if self._symlink.exists() and not self._symlink.is_symlink():
-            raise FileExistsError(f"{self._symlink} is no link, so it is left alone: choose another path")
-        beside = self._symlink.with_name(f".{self._symlink.name}.{os.getpid()}")
-        beside.symlink_to(self._device)
-        beside.replace(self._symlink)
+            raise FileExistsError(f"{self._symlink} is not a symlink, so it is not replaced: choose another path")
+        temporary = self._symlink.with_name(f".{self._symlink.name}.{os.getpid()}")
+        temporary.symlink_to(self._device)
+        temporary.replace(self._symlink)
 
     def _close_descriptors(self) -> None:
         os.close(self._slave)

@@ -1,7 +1,7 @@
-"""Simulated buses for other programs: one PTY a bus, or one arm on a TCP port, until cancelled. What `servobus sim` runs.
+"""Simulated buses for other programs: a PTY for each bus, or an arm on a TCP port. `servobus sim` runs it.
 
-The `port` of a bus plays no part, but for saying whether its hands are behind a RealMan arm. Bytes take their time at the rate
-that the PTY's user set, and a servo hears only its own.
+The `port` of a bus only decides whether its hands are behind a RealMan arm. Bytes take their time at the rate that the PTY's user
+set, and a servo receives only bytes at its own rate.
 """
 
 from __future__ import annotations
@@ -27,8 +27,16 @@ async def serve(
     *,
     folder: Path | None = None,
 ) -> None:
-    """`announce` is told name and path of each bus, once all can be opened. `models`: those of each bus, by bus name. `folder`:
-    where each path is a link with the name of its bus; its files are left alone. Raises FileExistsError, OSError."""
+    """Serve simulated buses until cancelled.
+
+    Args:
+        buses: options of each bus, by bus name.
+        models: models of each bus, by bus name.
+        announce: is called with the name and the path of each bus, once all can be opened.
+        folder: makes a symlink there for each PTY, with the name of its bus. Files in it are not replaced.
+
+    Raises FileExistsError, OSError.
+    """
     loop = asyncio.get_running_loop()
     async with AsyncExitStack() as stack:
         paths = {}

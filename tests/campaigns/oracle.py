@@ -22,7 +22,7 @@ from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.kst.codec import Command, KstCodec
 from servobus.protocols.kst.codec import encode as kst_encode
-from servobus.protocols.modbus.codec import Function, ModbusCodec, pack, words
+from servobus.protocols.modbus.codec import Function, ModbusCodec, pack, unpack
 from servobus.protocols.modbus.codec import encode as modbus_encode
 from servobus.protocols.options import FaultOptions
 from servobus.protocols.registry import PROTOCOLS
@@ -34,7 +34,7 @@ NUMBERS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class TunnelRequest:
     node: int
     what: Any
     heard: float
@@ -51,7 +51,7 @@ class Oracle(ABC):
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._deliver: Callable[[bytes], object] = bytes
-        self._questions: list[Question | None] = [None] * NUMBERS
+        self._questions: list[TunnelRequest | None] = [None] * NUMBERS
         self._count = 0
 
     def attach(self, deliver: Callable[[bytes], None]) -> None:
@@ -83,7 +83,7 @@ class Oracle(ABC):
 
     def _ask(self, node: int, what: Any, numbers: int = NUMBERS) -> int:
         self._count = number = (self._count + 1) % numbers
-        self._questions[number] = Question(node, what, self._loop.time())
+        self._questions[number] = TunnelRequest(node, what, self._loop.time())
         return number
 
     def _asked(self, number: int, node: int, what: Any, asked: float) -> bool:
@@ -182,7 +182,7 @@ class RohOracle(Oracle):
         heard = codec.next_reply()
         if heard is None or not 1 <= heard.unit <= SERVOS or heard.function != Function.READ_HOLDING:
             return None
-        address, count = words(heard.body)
+        address, count = unpack(heard.data)
         told = list(self.FIRST[:count]) if address == 1000 else self._words(self._ask(heard.unit, (address, count)), count)
         return modbus_encode(heard.unit, heard.function, bytes((2 * count,)) + pack(told))
 

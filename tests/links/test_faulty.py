@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from servobus.links.faulty import LONGEST_PIECE, MAX_NOISE, FaultyEnd
+from servobus.links.faulty import MAX_NOISE, MAX_PIECE, FaultyEnd
 from servobus.protocols.options import FaultOptions
 from tests.virtual_time import virtual
 
@@ -183,7 +183,7 @@ async def test_a_late_answer_is_out_of_the_way_when_its_time_has_come() -> None:
     assert heard == [b"\x01first"]
 
 
-@pytest.mark.parametrize(("chop", "longest"), [("bytes", 1), ("random", LONGEST_PIECE)])
+@pytest.mark.parametrize(("chop", "longest"), [("bytes", 1), ("random", MAX_PIECE)])
 @virtual
 async def test_pieces(chop: str, longest: int) -> None:
     """One in each pass of the loop, nothing lost, nothing overtaken."""

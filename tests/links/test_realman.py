@@ -185,7 +185,7 @@ async def test_somebody_who_is_no_arm() -> None:
         with pytest.raises(LinkDown, match="does not answer as a RealMan arm does"):
             async with open_rig(config(server.sockets[0].getsockname()[1])):
                 raise AssertionError
-    with pytest.raises(LinkDown, match="nobody listens there"):
+    with pytest.raises(LinkDown, match="no program listens there"):
         async with open_rig(config(server.sockets[0].getsockname()[1] if server.sockets else 1)):
             raise AssertionError
 

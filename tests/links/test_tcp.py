@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from servobus.errors import LinkDown
-from servobus.links.tcp import LATENCY, TcpLink, explain
+from servobus.links.tcp import LATENCY, TcpLink, explain_connect_error
 from servobus.protocols.base import LineTraits
 from tests.links.recorder import PATIENCE, Ear, on_each_loop
 
@@ -133,19 +133,22 @@ async def test_nobody_listens() -> None:
     with socket.socket() as reserved:  # bound, but it does not listen
         reserved.bind(("127.0.0.1", 0))
         port = reserved.getsockname()[1]
-        with pytest.raises(LinkDown, match=f"tcp://127.0.0.1:{port}: nobody listens there: check the port number"):
+        with pytest.raises(LinkDown, match=f"tcp://127.0.0.1:{port}: no program listens there: check the port number"):
             await TcpLink("127.0.0.1", port, 115_200).connect(ear)
     assert (ear.made, ear.lost) == (0, [])
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "text"),
     [
         (TimeoutError(), "tcp://server:23 does not answer: check the address, and whether the server is on"),
         (TimeoutError(errno.ETIMEDOUT, "timed out"), "tcp://server:23 does not answer"),
         (socket.gaierror(-2, "Name or service not known"), "knows no such host (Name or service not known): check the name"),
-        (OSError(errno.EHOSTUNREACH, "Connect call failed"), "no way leads there: check the address and the cable"),
-        (OSError(errno.ENETUNREACH, "Connect call failed"), "no way leads there: check the address and this machine's network"),
+        (OSError(errno.EHOSTUNREACH, "Connect call failed"), "there is no route to it: check the address and the cable"),
+        (
+            OSError(errno.ENETUNREACH, "Connect call failed"),
+            "there is no route to it: check the address and this machine's network",
+        ),
         (
             PermissionError(errno.EACCES, "Connect call failed"),
             "cannot be reached (Permission denied): check host, port and server",
@@ -153,10 +156,10 @@ async def test_nobody_listens() -> None:
         (OSError("Multiple exceptions: ..."), "cannot be reached (Multiple exceptions: ...): check host"),
     ],
 )
-def test_what_the_system_may_say(error: OSError, words: str) -> None:
-    told = explain("tcp://server:23", error)
-    assert str(told).startswith("tcp://server:23")
-    assert words in str(told)
+def test_what_the_system_may_say(error: OSError, text: str) -> None:
+    link_down = explain_connect_error("tcp://server:23", error)
+    assert str(link_down).startswith("tcp://server:23")
+    assert text in str(link_down)
 
 
 def test_traits_and_address() -> None:

@@ -18,7 +18,7 @@ import serial
 
 from servobus.errors import LinkDown, PortBusy, PortDenied, PortMissing
 from servobus.links.serial import SerialLink
-from servobus.links.tty import check_device, explain, find_holder, is_pty
+from servobus.links.tty import check_device, explain_open_error, find_holder, is_pty
 from tests.links.bare_pty import plugged
 from tests.links.recorder import Ear
 
@@ -67,7 +67,7 @@ async def test_a_file(tmp_path: Path) -> None:
     path.write_text("keep me")
     error = await connecting(str(path))
     assert isinstance(error, PortMissing)
-    assert str(error) == f"{path} is a regular file and no serial port: choose one that `servobus ports` shows"
+    assert str(error) == f"{path} is a regular file, not a serial port: choose one that `servobus ports` shows"
     assert path.read_text() == "keep me"
 
 
@@ -76,14 +76,14 @@ def test_other_things_that_are_no_port(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(tmp_path / "socket"))
         for path, kind in ((tmp_path, "a directory"), (tmp_path / "pipe", "a pipe"), (tmp_path / "socket", "a socket")):
-            with pytest.raises(PortMissing, match=f"{re.escape(str(path))} is {kind} and no serial port"):
+            with pytest.raises(PortMissing, match=f"{re.escape(str(path))} is {kind}, not a serial port"):
                 check_device(str(path))
 
 
 async def test_a_device_that_is_no_port() -> None:
     error = await connecting("/dev/null")
     assert isinstance(error, PortMissing)
-    assert str(error) == "/dev/null is a device, but no serial port: choose one that `servobus ports` shows"
+    assert str(error) == "/dev/null is a device, but not a serial port: choose one that `servobus ports` shows"
 
 
 async def test_a_path_through_a_file(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ async def test_busy() -> None:
             error = await connecting(pty.path)
             assert find_holder(pty.path) == (pid, name)
         assert isinstance(error, PortBusy)
-        assert str(error) == f"{pty.path} is held by process {pid} ({name}): end that first, or let it do the work"
+        assert str(error) == f"{pty.path} is open in process {pid} ({name}): end that first, or use the port through it"
         (await SerialLink(pty.path, 115_200).connect(Ear())).abort()
 
 
@@ -118,7 +118,7 @@ async def test_busy_here() -> None:
 
 def test_busy_and_nobody_to_be_seen(tmp_path: Path) -> None:
     """Who may not look into another user's process is told how to."""
-    error = explain(str(tmp_path), OSError(errno.EBUSY, "Device or resource busy"))
+    error = explain_open_error(str(tmp_path), OSError(errno.EBUSY, "Device or resource busy"))
     assert isinstance(error, PortBusy)
     assert f"`sudo fuser -v {tmp_path}`" in str(error)
 
@@ -140,7 +140,7 @@ def test_denied_to_those_outside_the_group(tmp_path: Path) -> None:
     port.chmod(0o660)
     if os.geteuid() == 0:
         os.chown(port, -1, 1)
-    error = explain(str(port), PermissionError(errno.EACCES, "Permission denied"))
+    error = explain_open_error(str(port), PermissionError(errno.EACCES, "Permission denied"))
     group = port.group()
     assert isinstance(error, PortDenied)
     assert str(error) == (
@@ -153,16 +153,16 @@ def test_denied_to_everybody(tmp_path: Path) -> None:
     port = tmp_path / "ttyUSB0"
     port.touch()
     port.chmod(0o600)
-    error = explain(str(port), PermissionError(errno.EACCES, "Permission denied"))
+    error = explain_open_error(str(port), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(error, PortDenied)
     assert f"nor by its group ({port.group()}): give it to group dialout by a udev rule" in str(error)
-    unseen = explain(str(tmp_path / "gone"), PermissionError(errno.EACCES, "Permission denied"))
+    unseen = explain_open_error(str(tmp_path / "gone"), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(unseen, PortDenied)
     assert "nor by its group (another group)" in str(unseen)
 
 
 @pytest.mark.parametrize(
-    ("error", "kind", "words"),
+    ("error", "kind", "text"),
     [
         (
             serial.SerialException(errno.ENOENT, "could not open port"),
@@ -173,16 +173,16 @@ def test_denied_to_everybody(tmp_path: Path) -> None:
         (OSError(errno.ENXIO, "No such device or address"), PortMissing, "no device behind it"),
         (termios.error(errno.EIO, "Input/output error"), PortMissing, "no device behind it"),
         (OSError(errno.EPERM, "Operation not permitted"), PortDenied, "start the container with `--device /dev/ttyUSB7`, or"),
-        (OSError(errno.EINVAL, "Invalid argument"), PortMissing, "no serial port"),
-        (serial.SerialException(errno.EWOULDBLOCK, "Could not exclusively lock port"), PortBusy, "is held by"),
+        (OSError(errno.EINVAL, "Invalid argument"), PortMissing, "not a serial port"),
+        (serial.SerialException(errno.EWOULDBLOCK, "Could not exclusively lock port"), PortBusy, "is open in"),
         (ValueError("Invalid baud rate: -1"), LinkDown, "cannot be opened (Invalid baud rate: -1): unplug it"),
     ],
 )
-def test_what_the_system_may_say(error: Exception, kind: type[LinkDown], words: str) -> None:
-    told = explain("/dev/ttyUSB7", error)
-    assert type(told) is kind
-    assert str(told).startswith("/dev/ttyUSB7 ")
-    assert words in str(told)
+def test_what_the_system_may_say(error: Exception, kind: type[LinkDown], text: str) -> None:
+    link_down = explain_open_error("/dev/ttyUSB7", error)
+    assert type(link_down) is kind
+    assert str(link_down).startswith("/dev/ttyUSB7 ")
+    assert text in str(link_down)
 
 
 def test_what_is_a_pty(tmp_path: Path) -> None:

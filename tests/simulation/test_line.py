@@ -11,7 +11,7 @@ import pytest
 from servobus.protocols.sms.codec import BROADCAST_ID, Instruction, SmsCodec, encode
 from servobus.protocols.sms.model_loading import packaged_models
 from servobus.protocols.sms.simulated.device import SmsDevice
-from servobus.simulation.line import SimulatedLine, blend, over
+from servobus.simulation.line import SimulatedLine, blend, overlay
 from tests.virtual_time import virtual
 
 PING = encode(1, Instruction.PING)
@@ -156,7 +156,7 @@ async def test_a_master_that_does_not_wait_is_drowned(parts: tuple[bytes, ...]) 
     """The reply is heard as the AND of both, and the second request by nobody."""
     async with listening([servo(1, baudrate=SLOW), servo(2, baudrate=SLOW)], baudrate=SLOW) as master:
         master.say(*parts)
-        assert await master.until(1) == [over(ACK, read_position(2), 0)]
+        assert await master.until(1) == [overlay(ACK, read_position(2), 0)]
         assert master.line.collisions == 1
         master.say(PING)
         assert (await master.until(2))[1:] == [ACK]
@@ -277,7 +277,7 @@ async def test_a_line_nobody_listens_to_goes_on() -> None:
 
 def test_bytes_that_meet_are_anded() -> None:
     """And a silent line is all ones."""
-    assert over(b"\xff\xf0\xff", b"\x0f\x3c", 1) == b"\xff\x00\x3c"
-    assert over(b"\xff\xf0", b"\x00\x3c\x00", -1) == b"\x3c\x00"
+    assert overlay(b"\xff\xf0\xff", b"\x0f\x3c", 1) == b"\xff\x00\x3c"
+    assert overlay(b"\xff\xf0", b"\x00\x3c\x00", -1) == b"\x3c\x00"
     assert blend(b"\x01", b"\x02", 2) == b"\x01\xff\x02"
     assert blend(b"\x0f\x0f\x0f", b"\x3c", 1) == b"\x0f\x0c\x0f"

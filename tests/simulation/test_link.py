@@ -54,7 +54,7 @@ def test_a_port_says_whether_bytes_take_time() -> None:
     """Two forms, and an error that names both for anything else."""
     assert (has_wire_time("sim:"), has_wire_time("sim:?wire_time=off")) == (True, False)
     for port in ("sim", "sim:?wire_time=on", "sim:arm", "/dev/ttyUSB0"):
-        with pytest.raises(ConfigError, match='no simulated line: write "sim:" or "sim:\\?wire_time=off"') as caught:
+        with pytest.raises(ConfigError, match='not a simulated line: write "sim:" or "sim:\\?wire_time=off"') as caught:
             has_wire_time(port)
         assert port in str(caught.value)
 

@@ -119,6 +119,6 @@ async def test_nothing_is_announced_where_a_file_is_in_the_way(tmp_path: Path) -
     (tmp_path / "leg").write_text("data")
     announced: list[str] = []
     buses = {"arm": bus(), "leg": bus()}
-    with pytest.raises(FileExistsError, match="leg is no link"):
+    with pytest.raises(FileExistsError, match="leg is not a symlink"):
         await serve(buses, dict.fromkeys(buses, packaged_models()), lambda name, path: announced.append(name), folder=tmp_path)
     assert (announced, os.listdir(tmp_path)) == ([], ["leg"])

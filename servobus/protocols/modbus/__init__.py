@@ -1,1 +1,1 @@
-"""Modbus-RTU: a language, not a device. Protocols whose devices speak it build on these frames and requests."""
+"""Modbus-RTU: a language that drivers and tunnels use, not a protocol of its own."""

@@ -1,8 +1,8 @@
-"""Modbus-RTU frames (ROH seed 1 and 3): unit, function, data, CRC-16 with its low byte first.
+"""Modbus-RTU frames (ROH Modbus, 1 and 3): unit, function, data, CRC-16 with its low byte first.
 
-RTU has no header and ends a frame by silence, which a codec cannot hear. So lengths are predicted from function and byte count,
-and a frame counts only when its CRC fits. Questions and answers have other lengths, hence one codec with a table for each end of
-the line; the master's also knows its own questions, because some lines echo them.
+RTU has no header, and ends a frame by silence, which a codec cannot see. So the codec predicts a frame's length from its function
+and byte count, and accepts the frame if its CRC is right. Requests and replies have different lengths, so there is a table for
+each end of the line. The master's table also has its own requests, because some lines echo them.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Literal, NamedTuple
 BROADCAST = 0
 MAX_UNIT = 247
 MAX_READ = 125
-"""Registers of one question: their bytes, and the frame, must be counted in one byte (256 bytes at most)."""
+"""Registers of one read, so that the frame has at most 256 bytes."""
 MAX_WRITE = 123
 REFUSED = 0x80
 """Set in the function of an exception."""
 CRC_SIZE = 2
 READ_SIZE = WRITE_SIZE = 8
-"""Bytes of a question for registers, of a single write either way, and of the answer to a write of many."""
+"""Bytes of a read request, of a single write in both directions, and of the reply to a write of several registers."""
 EXCEPTION_SIZE = 5
 MULTIPLE_OVERHEAD = 9
-"""Bytes of a write of many registers, without their values."""
+"""Bytes of a write of several registers, without their values."""
 REPLY_OVERHEAD = 5
-"""Bytes of an answer with registers, without their values."""
+"""Bytes of a reply with registers, without their values."""
 
 
 class Function(IntEnum):
-    """Seed 3.1 to 3.3."""
+    """The functions of ROH Modbus, 3.1 to 3.3."""
 
     READ_HOLDING = 0x03
     WRITE_SINGLE = 0x06
@@ -41,11 +41,11 @@ NAMES = {Function.READ_HOLDING: "READ", Function.WRITE_SINGLE: "WRITE ONE", Func
 
 
 class Frame(NamedTuple):
-    """One frame, either way. `body` is what stands between function and CRC."""
+    """One frame in either direction. `data`: the bytes between function and CRC."""
 
     unit: int
     function: int
-    body: bytes
+    data: bytes
     frame: bytes
 
     @property
@@ -58,13 +58,13 @@ class Frame(NamedTuple):
 
     @property
     def key(self) -> Hashable:
-        """An answer with registers names neither their address nor the question: only how many bytes they are."""
-        return reply_key(self.function, self.body[:1] if self.function == Function.READ_HOLDING else self.body[:4])
+        """What tells this reply from others. The reply to a read names the number of its bytes, and no address."""
+        return reply_key(self.function, self.data[:1] if self.function == Function.READ_HOLDING else self.data[:4])
 
 
-def reply_key(function: int, told: bytes) -> tuple[int, bytes]:
-    """What tells answers of one unit apart; `told`: what the answer repeats of the question."""
-    return (function, told)
+def reply_key(function: int, repeated: bytes) -> tuple[int, bytes]:
+    """Return what tells the replies of one unit apart. `repeated`: the part of the request that the reply repeats."""
+    return (function, repeated)
 
 
 def _crc_of(byte: int) -> int:
@@ -77,36 +77,37 @@ TABLE = tuple(_crc_of(byte) for byte in range(256))
 
 
 def crc16(data: bytes) -> int:
-    """Polynomial 0xA001, from 0xFFFF on."""
+    """Return the checksum: polynomial 0xA001, start value 0xFFFF."""
     crc = 0xFFFF
     for byte in data:
         crc = crc >> 8 ^ TABLE[(crc ^ byte) & 0xFF]
     return crc
 
 
-def encode(unit: int, function: int, body: bytes) -> bytes:
-    """The frame's bytes. Raises ValueError for a unit that cannot be addressed."""
+def encode(unit: int, function: int, data: bytes) -> bytes:
+    """Return the frame's bytes. Raises ValueError for a unit that cannot be addressed."""
     if not 0 <= unit <= MAX_UNIT:
         raise ValueError(f"unit {unit} is outside 1 to {MAX_UNIT} (or {BROADCAST} for all)")
-    head = bytes((unit, function)) + body
+    head = bytes((unit, function)) + data
     return head + crc16(head).to_bytes(CRC_SIZE, "little")
 
 
-def words(data: bytes) -> list[int]:
-    """Registers travel high byte first."""
+def unpack(data: bytes) -> list[int]:
+    """Return the registers in these bytes, high byte first."""
     return [data[at] << 8 | data[at + 1] for at in range(0, len(data) - 1, 2)]
 
 
 def pack(values: Sequence[int]) -> bytes:
+    """Return the bytes of these registers, high byte first."""
     return b"".join(value.to_bytes(2, "big") for value in values)
 
 
 Sizes = Sequence[int] | None
-"""Lengths a frame that begins here may have, the likeliest first; none: no frame begins here; None: too few bytes to tell."""
+"""Possible lengths of a frame that begins here, the likeliest first. Empty: no frame begins here. None: more bytes are needed."""
 
 
 def reply_sizes(buffer: bytes, at: int) -> Sizes:
-    """What a master may hear: an answer, an exception, or its own question."""
+    """Return the lengths of what a master may receive: a reply, an exception, or its own request."""
     left = len(buffer) - at
     if buffer[at] > MAX_UNIT:
         return ()
@@ -117,8 +118,8 @@ def reply_sizes(buffer: bytes, at: int) -> Sizes:
         if left < 3:
             return None
         count = buffer[at + 2]
-        answer = count and count % 2 == 0 and count <= 2 * MAX_READ
-        return (REPLY_OVERHEAD + count, READ_SIZE) if answer else (READ_SIZE,)
+        is_reply = count and count % 2 == 0 and count <= 2 * MAX_READ
+        return (REPLY_OVERHEAD + count, READ_SIZE) if is_reply else (READ_SIZE,)
     if function == Function.WRITE_MULTIPLE:
         return (WRITE_SIZE, *_multiple_size(buffer, at)) if left >= WRITE_SIZE else (WRITE_SIZE,)
     if function == Function.WRITE_SINGLE:
@@ -127,13 +128,13 @@ def reply_sizes(buffer: bytes, at: int) -> Sizes:
 
 
 FIXED = {1: 8, 2: 8, 3: 8, 4: 8, 5: 8, 6: 8, 7: 4, 8: 8, 11: 4, 12: 4, 17: 4, 22: 10, 24: 6}
-"""Function -> bytes of its question. The standard's others are here too: a device refuses them by name (EC01)."""
+"""Function -> bytes of its request. Includes the standard's other functions, which a device refuses by exception 1."""
 COUNTED = {15: 6, 16: 6, 23: 10}
-"""Function -> place of the byte that counts the rest."""
+"""Function -> index of the byte that counts the rest."""
 
 
 def request_sizes(buffer: bytes, at: int) -> Sizes:
-    """What a device may hear."""
+    """Return the lengths of what a device may receive."""
     left = len(buffer) - at
     if buffer[at] > MAX_UNIT:
         return ()
@@ -144,16 +145,16 @@ def request_sizes(buffer: bytes, at: int) -> Sizes:
         return (FIXED[function],)
     if function not in COUNTED:
         return ()
-    place = COUNTED[function]
-    if left <= place:
+    index = COUNTED[function]
+    if left <= index:
         return None
     if function == Function.WRITE_MULTIPLE:
         return _multiple_size(buffer, at)
-    return (place + 1 + buffer[at + place] + CRC_SIZE,)
+    return (index + 1 + buffer[at + index] + CRC_SIZE,)
 
 
 def _multiple_size(buffer: bytes, at: int) -> Sequence[int]:
-    """Of a write of many registers, where number and byte count fit each other."""
+    """Return the length of a write of several registers, if its count and byte count agree."""
     count = buffer[at + 4] << 8 | buffer[at + 5]
     size = buffer[at + 6]
     return (MULTIPLE_OVERHEAD + size,) if size == 2 * count and 1 <= count <= MAX_WRITE else ()
@@ -163,12 +164,12 @@ SIZES: dict[str, Callable[[bytes, int], Sizes]] = {"master": reply_sizes, "devic
 
 
 class ModbusCodec:
-    """Finds frames in a stream. Memory is bounded: what is kept between two calls is shorter than the frame it may begin."""
+    """Finds frames in a stream. Its memory is bounded: it keeps fewer bytes than the frame that they may begin."""
 
     __slots__ = ("_buffer", "_sizes", "skipped")
 
     def __init__(self, end: Literal["master", "device"] = "master") -> None:
-        """`end`: of the line; a master hears answers, a device questions."""
+        """`end`: which end of the line; a master receives replies, a device requests."""
         self._buffer = b""
         self._sizes = SIZES[end]
         self.skipped = 0
@@ -184,7 +185,7 @@ class ModbusCodec:
         self._buffer = b""
 
     def next_reply(self) -> Frame | None:
-        """The next frame with a right CRC; what cannot begin one is skipped and counted."""
+        """Return the next frame with a right CRC; skips and counts bytes that cannot begin one."""
         buffer = self._buffer
         for at in range(len(buffer)):
             sizes = self._sizes(buffer, at)
@@ -194,7 +195,7 @@ class ModbusCodec:
             for size in sizes:
                 end = at + size
                 if end > len(buffer):
-                    # It may be whole later; a shorter reading of it must not be believed before that is known.
+                    # It may become complete. A shorter interpretation must not be accepted before.
                     self._drop(at)
                     return None
                 if _crc_fits(buffer, at, end):
@@ -217,40 +218,40 @@ def _crc_fits(buffer: bytes, at: int, end: int) -> bool:
 
 
 def rename(frame: bytes, rng: Random) -> bytes:
-    """The same frame in the name of another unit."""
+    """Return the same frame with another unit's id."""
     unit = 1 + (frame[0] - 1 + rng.randint(1, MAX_UNIT - 1)) % MAX_UNIT
     return encode(unit, frame[1], frame[2:-CRC_SIZE])
 
 
 def node_of(frame: bytes) -> int:
-    """The unit of a whole frame."""
+    """Return the unit of a complete frame."""
     return frame[0]
 
 
 def describe(frame: bytes, *, sent: bool) -> str:
-    """A frame in words: what `decode` and `--trace` print."""
+    """Return one line about a frame, for `decode` and `--trace`."""
     codec = ModbusCodec("device" if sent else "master")
     codec.receive_data(frame)
-    found = codec.next_reply()
-    if found is None or found.frame != frame:
-        return f"no Modbus-RTU frame: {frame.hex(' ')}"
-    who = "all" if found.unit == BROADCAST else f"unit {found.unit}"
-    function = found.function & ~REFUSED
+    reply = codec.next_reply()
+    if reply is None or reply.frame != frame:
+        return f"not a Modbus-RTU frame: {frame.hex(' ')}"
+    who = "all" if reply.unit == BROADCAST else f"unit {reply.unit}"
+    function = reply.function & ~REFUSED
     name = NAMES.get(function, f"function 0x{function:02X}")  # type: ignore[call-overload]
-    return f"{who} {name} {_describe_body(found, sent)}".rstrip()
+    return f"{who} {name} {_describe_data(reply, sent)}".rstrip()
 
 
-def _describe_body(frame: Frame, sent: bool) -> str:
-    body = frame.body
+def _describe_data(frame: Frame, sent: bool) -> str:
+    data = frame.data
     if frame.function & REFUSED:
-        return f"refused: exception {body[0]}"
-    if not sent and frame.function == Function.READ_HOLDING and len(body) % 2:
-        return " ".join(map(str, words(body[1:])))
+        return f"refused: exception {data[0]}"
+    if not sent and frame.function == Function.READ_HOLDING and len(data) % 2:
+        return " ".join(map(str, unpack(data[1:])))
     if frame.function == Function.WRITE_SINGLE:
-        return "{} = {}".format(*words(body))
+        return "{} = {}".format(*unpack(data))
     if frame.function in NAMES:
-        address, count = words(body[:4])
+        address, count = unpack(data[:4])
         last = address + count - 1
-        values = f" = {' '.join(map(str, words(body[5:])))}" if len(body) > 4 else ""
+        values = f" = {' '.join(map(str, unpack(data[5:])))}" if len(data) > 4 else ""
         return f"{address} to {last}{values}" if count > 1 else f"{address}{values}"
-    return body.hex(" ")
+    return data.hex(" ")

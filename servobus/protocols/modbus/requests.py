@@ -1,8 +1,9 @@
-"""Reading and writing holding registers (ROH seed 3.1 to 3.4) as requests that know their reply.
+"""Reads and writes of holding registers as requests that know their reply (ROH Modbus, 3.1 to 3.4).
 
-A write brings back its address, and value or number, so its answer is known for sure. The answer to a read says unit and byte
-count only: that is its `reply_key`, and a fence is a read of another number of registers. The answer to a single write (0x06) is
-the question itself, and an echo of it looks the same; so single registers are written with 0x10 unless the config says otherwise.
+A write's reply repeats the address and the value or count, so it cannot be confused with another one. A read's reply names only
+the unit and the number of bytes: that is its `reply_key`, and a fence is a read of another number of registers. The reply to a
+single write (0x06) equals the request, and an echo looks the same; so one register is written with 0x10 too, unless the config
+says otherwise.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from servobus.protocols.modbus.codec import (
     encode,
     pack,
     reply_key,
-    words,
+    unpack,
 )
 
 R = TypeVar("R")
@@ -37,16 +38,16 @@ MIN_GAP = 0.00175
 GAP_CHARACTERS = 3.5
 CHARACTER_BITS = 11
 TURNAROUND = 0.1
-"""Seconds a unit gets after a broadcast; Modbus serial line names 100 to 200 ms."""
-PATIENCE = 0.005
-"""Seconds within which an answer that nobody waits for is expected to begin; no document names a time."""
+"""Seconds of silence after a broadcast; "Modbus over serial line" recommends 100 to 200 ms."""
+UNANSWERED_PATIENCE = 0.005
+"""Seconds within which a reply that is not waited for is expected to begin; no document gives a time."""
 
 EXCEPTIONS = {
     0x01: "illegal function",
     0x02: "illegal data address",
     0x03: "illegal data value",
     0x04: "device failure",
-    0x05: "accepted, and still at work",
+    0x05: "accepted, and still in progress",
     0x06: "busy",
     0x08: "memory parity error",
     0x0A: "gateway path unavailable",
@@ -55,70 +56,72 @@ EXCEPTIONS = {
 DEVICE_FAILURE = 0x04
 NO_ANSWER = 0x0B
 GATEWAY = frozenset({0x0A, NO_ANSWER})
-"""Said by who passes the question on, not by the unit."""
+"""Exceptions that a gateway sends in the unit's name."""
 
 
 @dataclass(frozen=True, slots=True)
-class FrameTiming:
-    """What every request of a line has in common. Seconds."""
+class RtuTiming:
+    """The silences that the requests of a line need, in seconds."""
 
     gap: float = MIN_GAP
-    """Silence between two frames."""
+    """Between two frames."""
     turnaround: float = TURNAROUND
-    """More silence after a broadcast."""
-    guard: float = MIN_GAP + PATIENCE
-    """Silence after what is told to a unit that does not answer: time for an answer that comes nevertheless."""
+    """After a broadcast, in addition to the gap."""
+    guard: float = MIN_GAP + UNANSWERED_PATIENCE
+    """After a write whose reply is not waited for: long enough for a reply that comes nevertheless."""
 
     @classmethod
-    def at(cls, baudrate: int, turnaround: float = TURNAROUND) -> FrameTiming:
-        """3.5 characters, and not below 1.75 ms."""
+    def at(cls, baudrate: int, turnaround: float = TURNAROUND) -> RtuTiming:
+        """Return the timing at a baud rate: a gap of 3.5 characters, but at least 1.75 ms."""
         gap = max(MIN_GAP, GAP_CHARACTERS * CHARACTER_BITS / baudrate)
-        return cls(gap, turnaround, gap + PATIENCE + WRITE_SIZE * CHARACTER_BITS / baudrate)
+        return cls(gap, turnaround, gap + UNANSWERED_PATIENCE + WRITE_SIZE * CHARACTER_BITS / baudrate)
 
 
 class ModbusRequest(Request[R]):
-    """One question to one unit, or a write to all of them."""
+    """A request to one unit, or a write to all units."""
 
-    def __init__(self, timing: FrameTiming, unit: int, function: Function, body: bytes, told: bytes, size: int) -> None:
-        """`told`: what the answer repeats, from its third byte on; `size`: bytes of the answer."""
+    def __init__(self, timing: RtuTiming, unit: int, function: Function, data: bytes, repeated: bytes, size: int) -> None:
+        """`repeated`: what the reply repeats, from its third byte on. `size`: bytes of the reply."""
         self.node = unit
-        self.frame = encode(unit, function, body)
+        self.frame = encode(unit, function, data)
         self.function = function
-        self.told = told
+        self.repeated = repeated
         self.replies = int(unit != BROADCAST)
         self.nodes = (unit,) if self.replies else ()
         self.reply_size = size
-        self.reply_key = reply_key(function, told)
+        self.reply_key = reply_key(function, repeated)
         self.quiet_after = timing.gap if self.replies else timing.gap + timing.turnaround
 
     def answers(self, reply: Frame) -> bool:
-        return reply.unit == self.node and (self._fits(reply) or reply.function == self.function | REFUSED)
+        return reply.unit == self.node and (self._matches(reply) or reply.function == self.function | REFUSED)
 
-    def _fits(self, reply: Frame) -> bool:
-        return reply.function == self.function and reply.body == self.told
+    def _matches(self, reply: Frame) -> bool:
+        return reply.function == self.function and reply.data == self.repeated
 
     def parse(self, replies: Sequence[Frame]) -> R:
         if replies and replies[0].function & REFUSED:
             raise self.refusal(replies[0])
-        return self.value(replies[0].body if replies else b"")
+        return self.value(replies[0].data if replies else b"")
 
     def refusal(self, reply: Frame) -> DeviceError:
-        code = reply.body[0]
+        """Return the error for an exception reply."""
+        code = reply.data[0]
         meaning = EXCEPTIONS.get(code, "an exception of its own")
         return DeviceError(f"unit {self.node} refused: {meaning} ({code})", code=code, request=self, raw=reply.frame)
 
     @abstractmethod
-    def value(self, body: bytes) -> R:
-        """Of an answer that is no exception."""
+    def value(self, data: bytes) -> R:
+        """Return the value of a reply that is not an exception."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.frame.hex(' ')})"
 
 
 class ReadHolding(ModbusRequest[R]):
-    """0x03: `count` registers from `address` on; `make` makes the value of them. Raises ValueError above 125."""
+    """0x03: reads `count` registers from `address` on."""
 
-    def __init__(self, timing: FrameTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R]) -> None:
+    def __init__(self, timing: RtuTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R]) -> None:
+        """`make`: returns the request's value for the registers. Raises ValueError outside 1 to 125 registers."""
         if unit == BROADCAST or not 1 <= count <= MAX_READ:
             raise ValueError(f"a read asks one unit for 1 to {MAX_READ} registers, found unit {unit}, {count} registers")
         size = 2 * count
@@ -127,33 +130,35 @@ class ReadHolding(ModbusRequest[R]):
         self.count = count
         self.make = make
 
-    def _fits(self, reply: Frame) -> bool:
-        return reply.function == self.function and reply.body[:1] == self.told and len(reply.body) == 2 * self.count + 1
+    def _matches(self, reply: Frame) -> bool:
+        return reply.function == self.function and reply.data[:1] == self.repeated and len(reply.data) == 2 * self.count + 1
 
-    def value(self, body: bytes) -> R:
-        return self.make(words(body[1:]))
+    def value(self, data: bytes) -> R:
+        return self.make(unpack(data[1:]))
 
 
-class Probe(ReadHolding[R | None]):
-    """A read that asks whether the unit is there: it is, too, when it refuses (None); but not when a gateway speaks for it."""
+class PresenceRead(ReadHolding[R | None]):
+    """A read that shows whether the unit is there. A refusal by the unit shows it too (None); a gateway's refusal does not."""
 
     def answers(self, reply: Frame) -> bool:
-        return super().answers(reply) and not (reply.function & REFUSED and reply.body[0] in GATEWAY)
+        return super().answers(reply) and not (reply.function & REFUSED and reply.data[0] in GATEWAY)
 
     def parse(self, replies: Sequence[Frame]) -> R | None:
         return None if replies[0].function & REFUSED else super().parse(replies)
 
 
-class Fence(Probe[R]):
-    """A read whose number of registers nobody asked for lately. Not repeated: the next fence has another number, or its answer
-    could be that of this one."""
+class Fence(PresenceRead[R]):
+    """A read of a number of registers that no reply still under way can have.
+
+    It is not repeated: the next fence needs another number, or this one's late reply could answer it.
+    """
 
     idempotent = False
 
     def __init__(
-        self, timing: FrameTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R], *, refusable: bool
+        self, timing: RtuTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R], *, refusable: bool
     ) -> None:
-        """`refusable`: no other read is under way, so that a refusal can only be of this one."""
+        """`refusable`: no other read is under way, so a refusal can only answer this one."""
         super().__init__(timing, unit, address, count, make)
         self.refusable = refusable
 
@@ -162,44 +167,46 @@ class Fence(Probe[R]):
 
 
 class Write(ModbusRequest[None]):
-    """What all writes share: what they bring back has been checked by `answers`."""
+    """What all writes share; `answers` has compared what the reply repeats."""
 
-    def value(self, body: bytes) -> None:
-        """The unit took it."""
+    def value(self, data: bytes) -> None:
+        """Return nothing: the unit accepted the write."""
 
 
 class WriteSingle(Write):
-    """0x06: one register. Its right answer is the question itself, so it is only for lines without an echo."""
+    """0x06: writes one register. Only for lines without an echo, because the correct reply equals the request."""
 
     mirrored = True
 
-    def __init__(self, timing: FrameTiming, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
-        body = pack((address, value))
-        super().__init__(timing, unit, Function.WRITE_SINGLE, body, body, WRITE_SIZE)
+    def __init__(self, timing: RtuTiming, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
+        """`repeat`: it may be sent again when no reply came."""
+        data = pack((address, value))
+        super().__init__(timing, unit, Function.WRITE_SINGLE, data, data, WRITE_SIZE)
         self.idempotent = repeat
 
 
 class WriteMultiple(Write):
-    """0x10: registers from `address` on. A unit may stop at the first it refuses, so a refused write may be applied in part."""
+    """0x10: writes registers from `address` on. A unit may stop at the first one it refuses, so a refused write may be applied in
+    part."""
 
-    def __init__(self, timing: FrameTiming, unit: int, address: int, values: Sequence[int], *, repeat: bool = True) -> None:
-        """`repeat`: may be said again when no answer came. Raises ValueError outside 1 to 123 values."""
+    def __init__(self, timing: RtuTiming, unit: int, address: int, values: Sequence[int], *, repeat: bool = True) -> None:
+        """`repeat`: it may be sent again when no reply came. Raises ValueError outside 1 to 123 values."""
         count = len(values)
         if not 1 <= count <= MAX_WRITE:
             raise ValueError(f"a write carries 1 to {MAX_WRITE} registers, found {count}")
-        told = pack((address, count))
-        super().__init__(timing, unit, Function.WRITE_MULTIPLE, told + bytes((2 * count,)) + pack(values), told, READ_SIZE)
+        span = pack((address, count))
+        super().__init__(timing, unit, Function.WRITE_MULTIPLE, span + bytes((2 * count,)) + pack(values), span, READ_SIZE)
         self.idempotent = repeat
         self.address = address
         self.count = count
 
 
-class Tell(WriteMultiple):
-    """A write whose answer nobody waits for; the line stays silent for the time that one would take."""
+class UnansweredWrite(WriteMultiple):
+    """A write whose reply is not waited for; the line stays silent as long as a reply would take."""
 
     replies = 0
 
-    def __init__(self, timing: FrameTiming, unit: int, address: int, values: Sequence[int]) -> None:
+    def __init__(self, timing: RtuTiming, unit: int, address: int, values: Sequence[int]) -> None:
         super().__init__(timing, unit, address, values)
         self.replies = 0
         self.nodes = ()

@@ -1,1 +1,1 @@
-"""The JSON lines by which a RealMan arm passes Modbus on to its RS485 ports: a language, for a link and a simulator."""
+"""The language of RealMan arms, which pass Modbus-RTU on to their RS485 ports (RealMan JSON). A link and a simulator speak it."""

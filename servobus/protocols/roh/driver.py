@@ -15,7 +15,7 @@ from typing import Any
 from servobus.errors import DeviceError, LimitError, ServobusError, UnknownName
 from servobus.protocols.base import Driver, GoalPlan, LineTraits, Plan, Poll, Request, ask
 from servobus.protocols.modbus.codec import MAX_UNIT, Function
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, FrameTiming, Probe
+from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, PresenceRead, RtuTiming
 from servobus.protocols.roh import goals, stop
 from servobus.protocols.roh.commissioning import Commissioning
 from servobus.protocols.roh.finger import Finger
@@ -43,7 +43,7 @@ class RohDriver(Driver):
 
     def __init__(self, options: RohBus, models: Mapping[str, RohModel]) -> None:
         self.options = options
-        self.timing = FrameTiming.at(options.baudrate, options.turnaround_ms / 1000)
+        self.timing = RtuTiming.at(options.baudrate, options.turnaround_ms / 1000)
         self.limits = Limits(*options.limits(LineTraits()))
         self.fingers = {name: Finger(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: finger.node for name, finger in self.fingers.items()}
@@ -81,7 +81,7 @@ class RohDriver(Driver):
 
     def ping(self, node: int) -> Request[int | None]:
         """Read the first register; a refusal is an answer too. There is no status byte."""
-        return Probe(self.timing, node, FIRST, 1, _nothing)
+        return PresenceRead(self.timing, node, FIRST, 1, _nothing)
 
     def unused(self) -> Request[Any]:
         free = (unit for unit in range(MAX_UNIT, 0, -1) if unit not in self.hands)

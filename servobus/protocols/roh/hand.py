@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Plan, Request, ask
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, FrameTiming, ReadHolding, WriteMultiple, WriteSingle
+from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, ReadHolding, RtuTiming, WriteMultiple, WriteSingle
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.model_loading import NEWEST
@@ -47,7 +47,7 @@ class Hand:
         fingers: Sequence[Finger],
         pinned: str,
         models: Mapping[str, RohModel],
-        timing: FrameTiming,
+        timing: RtuTiming,
         limits: Limits,
     ) -> None:
         self.unit = unit

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 from servobus.errors import LimitError, ServobusError
 from servobus.protocols.base import Plan, ask
-from servobus.protocols.modbus.requests import Tell
+from servobus.protocols.modbus.requests import UnansweredWrite
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.goals import Word, write_words
 from servobus.protocols.roh.hand import Hand
@@ -100,7 +100,7 @@ def _tell(hand: Hand, targets: Targets) -> Plan[dict[str, StopReport]]:
         for finger in run:
             finger.may_hold(raws[finger])
         for _ in range(TIMES):
-            yield from ask(Tell(hand.timing, hand.unit, span.start, values))
+            yield from ask(UnansweredWrite(hand.timing, hand.unit, span.start, values))
     return {
         finger.name: StopReport(
             "hold",

@@ -23,7 +23,7 @@ from servobus.protocols.modbus.codec import (
     pack,
     rename,
     reply_key,
-    words,
+    unpack,
 )
 
 READ = encode(2, Function.READ_HOLDING, pack((1135, 6)))
@@ -101,7 +101,7 @@ def test_units_at_the_edge(unit: int) -> None:
 
 @given(st.lists(st.integers(0, 65535), max_size=20))
 def test_words_round_trip(values: list[int]) -> None:
-    assert words(pack(values)) == values
+    assert unpack(pack(values)) == values
 
 
 # Both ends
@@ -210,7 +210,7 @@ def test_a_write_whose_number_and_bytes_differ_is_none(registers: int, size: int
 
 
 @pytest.mark.parametrize(
-    "body",
+    "content",
     [
         (1, pack((0, 1))),
         (5, pack((0, 1))),
@@ -221,8 +221,8 @@ def test_a_write_whose_number_and_bytes_differ_is_none(registers: int, size: int
         (24, bytes(2)),
     ],
 )
-def test_a_device_hears_the_standards_other_questions_too(body: tuple[int, bytes]) -> None:
-    data = encode(2, *body)
+def test_a_device_reads_the_other_functions_too(content: tuple[int, bytes]) -> None:
+    data = encode(2, *content)
     assert found(ModbusCodec("device"), *chopped(data + READ, "bytes")) == [data, READ]
 
 
@@ -266,8 +266,8 @@ def test_renamed_it_is_another_units_and_right(frame: bytes, seed: int) -> None:
         (NO, False, "unit 2 WRITE refused: exception 4"),
         (encode(2, 7, b""), True, "unit 2 function 0x07"),
         (encode(2, 1, pack((0, 8))), True, "unit 2 function 0x01 00 00 00 08"),
-        (REPLY[:-1], False, f"no Modbus-RTU frame: {REPLY[:-1].hex(' ')}"),
-        (WROTE + b"\0", False, f"no Modbus-RTU frame: {(WROTE + bytes(1)).hex(' ')}"),
+        (REPLY[:-1], False, f"not a Modbus-RTU frame: {REPLY[:-1].hex(' ')}"),
+        (WROTE + b"\0", False, f"not a Modbus-RTU frame: {(WROTE + bytes(1)).hex(' ')}"),
     ],
 )
 def test_frames_in_words(frame: bytes, sent: bool, text: str) -> None:

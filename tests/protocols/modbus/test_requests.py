@@ -12,15 +12,15 @@ from servobus.protocols.modbus.requests import (
     EXCEPTIONS,
     MIN_GAP,
     Fence,
-    FrameTiming,
-    Probe,
+    PresenceRead,
     ReadHolding,
-    Tell,
+    RtuTiming,
+    UnansweredWrite,
     WriteMultiple,
     WriteSingle,
 )
 
-WIRE = FrameTiming()
+TIMING = RtuTiming()
 
 
 def frame(text: str | bytes) -> Frame:
@@ -34,7 +34,7 @@ def frame(text: str | bytes) -> Frame:
 
 
 def read(address: int, count: int, unit: int = 2) -> ReadHolding[list[int]]:
-    return ReadHolding(WIRE, unit, address, count, list)
+    return ReadHolding(TIMING, unit, address, count, list)
 
 
 # Golden frames
@@ -44,14 +44,14 @@ def read(address: int, count: int, unit: int = 2) -> ReadHolding[list[int]]:
     ("request_", "said"),
     [
         (read(0x6B, 2, 0x11), "11 03 00 6b 00 02 b7 47"),
-        (WriteSingle(WIRE, 0x11, 0x6B, 0x1000), "11 06 00 6b 10 00 f7 46"),
-        (WriteMultiple(WIRE, 0x11, 1, [0x000A, 0x0102]), "11 10 00 01 00 02 04 00 0a 01 02 c6 f0"),
+        (WriteSingle(TIMING, 0x11, 0x6B, 0x1000), "11 06 00 6b 10 00 f7 46"),
+        (WriteMultiple(TIMING, 0x11, 1, [0x000A, 0x0102]), "11 10 00 01 00 02 04 00 0a 01 02 c6 f0"),
         (read(1000, 1), "02 03 03 e8 00 01 04 49"),
-        (WriteMultiple(WIRE, 2, 1135, [0] * 5 + [65535]), "02 10 04 6f 00 06 0c" + " 00" * 10 + " ff ff 60 3e"),
-        (WriteMultiple(WIRE, 2, 1125, [0] * 5 + [65535]), "02 10 04 65 00 06 0c" + " 00" * 10 + " ff ff e6 99"),
-        (WriteSingle(WIRE, 2, 1010, 500), "02 06 03 f2 01 f4 28 59"),
+        (WriteMultiple(TIMING, 2, 1135, [0] * 5 + [65535]), "02 10 04 6f 00 06 0c" + " 00" * 10 + " ff ff 60 3e"),
+        (WriteMultiple(TIMING, 2, 1125, [0] * 5 + [65535]), "02 10 04 65 00 06 0c" + " 00" * 10 + " ff ff e6 99"),
+        (WriteSingle(TIMING, 2, 1010, 500), "02 06 03 f2 01 f4 28 59"),
         (read(1006, 1), "02 03 03 ee 00 01 e4 48"),
-        (WriteSingle(WIRE, 0, 1010, 500), "00 06 03 f2 01 f4 29 bb"),
+        (WriteSingle(TIMING, 0, 1010, 500), "00 06 03 f2 01 f4 29 bb"),
     ],
 )
 def test_questions(request_: ReadHolding[list[int]] | WriteSingle | WriteMultiple, said: str) -> None:
@@ -62,7 +62,7 @@ def test_questions(request_: ReadHolding[list[int]] | WriteSingle | WriteMultipl
 def test_the_seeds_answers() -> None:
     asked = read(0x6B, 2, 0x11)
     assert asked.parse([frame(encode(0x11, 3, b"\x04\0\1\0\2"))]) == [1, 2]
-    assert WriteMultiple(WIRE, 0x11, 1, [10, 0x102]).answers(frame(encode(0x11, 0x10, pack((1, 2)))))
+    assert WriteMultiple(TIMING, 0x11, 1, [10, 0x102]).answers(frame(encode(0x11, 0x10, pack((1, 2)))))
 
 
 @pytest.mark.parametrize(("said", "word"), [("02 03 02 01 00 fd d4", 0x0100), ("02 03 02 03 00 fc b4", 0x0300)])
@@ -72,7 +72,7 @@ def test_the_first_register(said: str, word: int) -> None:
 
 
 def test_a_write_of_six_and_its_answers() -> None:
-    asked = WriteMultiple(WIRE, 2, 1135, [0] * 6)
+    asked = WriteMultiple(TIMING, 2, 1135, [0] * 6)
     yes, no = frame("02 10 04 6f 00 06 71 15"), frame("02 90 04 bd c3")
     assert asked.answers(yes)
     asked.parse([yes])
@@ -100,12 +100,12 @@ def test_an_answer_fits_in_unit_function_count_and_echo() -> None:
         encode(3, 0x83, b"\1"),
     ]
     assert not any(asked.answers(frame(data)) for data in wrong)
-    write = WriteMultiple(WIRE, 2, 1135, [1, 2])
-    for body in (pack((1134, 2)), pack((1135, 1)), pack((1135, 3))):
-        assert not write.answers(frame(encode(2, 16, body)))
-    single = WriteSingle(WIRE, 2, 1135, 9)
-    for body in (pack((1134, 9)), pack((1135, 8))):
-        assert not single.answers(frame(encode(2, 6, body)))
+    write = WriteMultiple(TIMING, 2, 1135, [1, 2])
+    for data in (pack((1134, 2)), pack((1135, 1)), pack((1135, 3))):
+        assert not write.answers(frame(encode(2, 16, data)))
+    single = WriteSingle(TIMING, 2, 1135, 9)
+    for data in (pack((1134, 9)), pack((1135, 8))):
+        assert not single.answers(frame(encode(2, 6, data)))
     assert single.answers(frame(single.frame))
 
 
@@ -119,14 +119,14 @@ def test_the_echo_of_a_read_is_no_answer(address: int) -> None:
 
 
 def test_the_echo_of_a_write_of_many_is_no_answer() -> None:
-    asked = WriteMultiple(WIRE, 2, 1135, [1, 2])
+    asked = WriteMultiple(TIMING, 2, 1135, [1, 2])
     assert not asked.answers(frame(asked.frame))
     assert asked.plain() is None
 
 
 def test_only_a_single_write_is_answered_by_itself() -> None:
-    assert WriteSingle(WIRE, 2, 1135, 9).mirrored
-    assert not WriteMultiple(WIRE, 2, 1135, [9]).mirrored
+    assert WriteSingle(TIMING, 2, 1135, 9).mirrored
+    assert not WriteMultiple(TIMING, 2, 1135, [9]).mirrored
 
 
 @given(st.integers(1, MAX_READ), st.integers(1, MAX_READ))
@@ -147,7 +147,7 @@ def test_exceptions_have_names(code: int) -> None:
 
 
 def test_a_unit_that_refuses_a_probe_is_there_but_not_one_a_gateway_speaks_for() -> None:
-    probe = Probe(WIRE, 2, 1000, 1, list)
+    probe = PresenceRead(TIMING, 2, 1000, 1, list)
     assert probe.parse([frame("02 03 02 01 00 fd d4")]) == [0x100]
     for code in (1, 4):
         refused = frame(encode(2, 0x83, bytes((code,))))
@@ -159,7 +159,7 @@ def test_a_unit_that_refuses_a_probe_is_there_but_not_one_a_gateway_speaks_for()
 
 @pytest.mark.parametrize("refusable", [True, False])
 def test_a_fence_takes_a_refusal_only_when_no_other_read_can_have_it(refusable: bool) -> None:
-    fence = Fence(WIRE, 2, 1000, 2, list, refusable=refusable)
+    fence = Fence(TIMING, 2, 1000, 2, list, refusable=refusable)
     assert not fence.idempotent
     assert fence.answers(frame(encode(2, 0x83, b"\4"))) == refusable
     assert fence.answers(frame(encode(2, 3, b"\4" + bytes(4))))
@@ -170,13 +170,13 @@ def test_a_fence_takes_a_refusal_only_when_no_other_read_can_have_it(refusable: 
 
 def test_frames_are_apart() -> None:
     assert read(1, 1).quiet_after == MIN_GAP
-    assert FrameTiming.at(115_200).gap == FrameTiming.at(22_000).gap == MIN_GAP
-    assert FrameTiming.at(19_200).gap == pytest.approx(3.5 * 11 / 19_200)
-    assert WriteMultiple(FrameTiming.at(9_600), 2, 1, [1]).quiet_after == pytest.approx(3.5 * 11 / 9_600)
+    assert RtuTiming.at(115_200).gap == RtuTiming.at(22_000).gap == MIN_GAP
+    assert RtuTiming.at(19_200).gap == pytest.approx(3.5 * 11 / 19_200)
+    assert WriteMultiple(RtuTiming.at(9_600), 2, 1, [1]).quiet_after == pytest.approx(3.5 * 11 / 9_600)
 
 
 def test_a_broadcast_is_not_answered_and_followed_by_a_longer_silence() -> None:
-    timing = FrameTiming.at(115_200, 0.2)
+    timing = RtuTiming.at(115_200, 0.2)
     for asked in (WriteSingle(timing, 0, 1010, 500), WriteMultiple(timing, 0, 1010, [500])):
         assert (asked.replies, asked.nodes) == (0, ())
         assert asked.quiet_after == pytest.approx(MIN_GAP + 0.2)
@@ -184,8 +184,8 @@ def test_a_broadcast_is_not_answered_and_followed_by_a_longer_silence() -> None:
 
 
 def test_what_is_told_leaves_time_for_an_answer_nobody_waits_for() -> None:
-    told = Tell(FrameTiming.at(115_200), 2, 1135, [1])
-    assert told.frame == WriteMultiple(WIRE, 2, 1135, [1]).frame
+    told = UnansweredWrite(RtuTiming.at(115_200), 2, 1135, [1])
+    assert told.frame == WriteMultiple(TIMING, 2, 1135, [1]).frame
     assert (told.replies, told.nodes) == (0, ())
     assert 0.005 < told.quiet_after < 0.01
     told.parse(())
@@ -207,19 +207,19 @@ def test_reads_beyond_the_edge(unit: int, count: int) -> None:
 
 @pytest.mark.parametrize("count", [1, MAX_WRITE])
 def test_writes_at_the_edge(count: int) -> None:
-    assert len(WriteMultiple(WIRE, 2, 0, [0] * count).frame) == 9 + 2 * count
+    assert len(WriteMultiple(TIMING, 2, 0, [0] * count).frame) == 9 + 2 * count
 
 
 @pytest.mark.parametrize("count", [0, MAX_WRITE + 1])
 def test_writes_beyond_the_edge(count: int) -> None:
     with pytest.raises(ValueError, match="1 to 123"):
-        WriteMultiple(WIRE, 2, 0, [0] * count)
+        WriteMultiple(TIMING, 2, 0, [0] * count)
 
 
 @given(st.integers(1, 247), st.integers(0, 65400), st.lists(st.integers(0, 65535), min_size=1, max_size=MAX_WRITE))
 def test_round_trip(unit: int, address: int, values: list[int]) -> None:
     codec = ModbusCodec("device")
-    for asked in (WriteMultiple(WIRE, unit, address, values), WriteSingle(WIRE, unit, address, values[0])):
+    for asked in (WriteMultiple(TIMING, unit, address, values), WriteSingle(TIMING, unit, address, values[0])):
         codec.receive_data(asked.frame)
         heard = codec.next_reply()
         assert heard is not None

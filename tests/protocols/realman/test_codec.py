@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from servobus.protocols.realman.codec import (
     MAX_LINE,
-    Lines,
+    JsonLines,
     dialect,
     encode,
     generation_of,
@@ -47,9 +47,9 @@ GOLDEN = [
 ]
 
 
-@pytest.mark.parametrize(("step", "line"), GOLDEN)
-def test_commands_as_the_documents_have_them(step: Any, line: bytes) -> None:
-    assert encode(step.message) == line
+@pytest.mark.parametrize(("command", "line"), GOLDEN)
+def test_commands_as_the_documents_have_them(command: Any, line: bytes) -> None:
+    assert encode(command.message) == line
 
 
 def test_limits_of_each_generation() -> None:
@@ -61,29 +61,29 @@ def test_limits_of_each_generation() -> None:
     assert NEW.close_mode() is None
 
 
-ONE, SIX, WORDS = OLD.read(2, 1, 1), OLD.read(2, 1, 2), NEW.read(2, 1, 2)
+ONE, PAIRS, TWO = OLD.read(2, 1, 1), OLD.read(2, 1, 2), NEW.read(2, 1, 2)
 
 
 @pytest.mark.parametrize(
-    ("step", "reply", "words"),
+    ("command", "reply", "registers"),
     [
         (ONE, {"command": "read_holding_registers", "data": 512}, [512]),
         (ONE, {"command": "read_holding_registers", "data": -1}, [65535]),
         (ONE, {"command": "read_holding_registers", "data": 65535}, [65535]),
-        (SIX, {"command": "read_multiple_holding_registers", "data": [1, 2, 255, 254]}, [258, 65534]),
-        (WORDS, {"command": "read_modbus_rtu_holding_registers", "data": [258, 65534], "read_state": True}, [258, 65534]),
+        (PAIRS, {"command": "read_multiple_holding_registers", "data": [1, 2, 255, 254]}, [258, 65534]),
+        (TWO, {"command": "read_modbus_rtu_holding_registers", "data": [258, 65534], "read_state": True}, [258, 65534]),
         (ONE, {"command": "read_holding_registers", "read_state": False}, None),
         (OLD.write(2, 1, [1]), {"command": "write_single_register", "write_state": True}, []),
         (OLD.write(2, 1, [1]), {"command": "write_single_register", "write_state": False}, None),
     ],
 )
-def test_what_answers(step: Any, reply: dict[str, Any], words: list[int] | None) -> None:
-    assert step.answers(reply)
-    assert step.words(reply) == words
+def test_what_answers(command: Any, reply: dict[str, Any], registers: list[int] | None) -> None:
+    assert command.answers(reply)
+    assert command.registers(reply) == registers
 
 
 @pytest.mark.parametrize(
-    ("step", "reply"),
+    ("command", "reply"),
     [
         (ONE, {"command": "read_multiple_holding_registers", "data": [1, 2]}),
         (ONE, {"command": "read_holding_registers"}),
@@ -92,18 +92,18 @@ def test_what_answers(step: Any, reply: dict[str, Any], words: list[int] | None)
         (ONE, {"command": "read_holding_registers", "data": 1.0}),
         (ONE, {"command": "read_holding_registers", "data": 65536}),
         (ONE, {"command": "read_holding_registers", "data": -32769}),
-        (SIX, {"command": "read_multiple_holding_registers", "data": [1, 2, 3]}),
-        (SIX, {"command": "read_multiple_holding_registers", "data": [1, 2, 3, 256]}),
-        (SIX, {"command": "read_multiple_holding_registers", "data": [1, 2, 3, -1]}),
-        (SIX, {"command": "read_multiple_holding_registers", "data": "abcd"}),
-        (WORDS, {"command": "read_modbus_rtu_holding_registers", "data": [1]}),
+        (PAIRS, {"command": "read_multiple_holding_registers", "data": [1, 2, 3]}),
+        (PAIRS, {"command": "read_multiple_holding_registers", "data": [1, 2, 3, 256]}),
+        (PAIRS, {"command": "read_multiple_holding_registers", "data": [1, 2, 3, -1]}),
+        (PAIRS, {"command": "read_multiple_holding_registers", "data": "abcd"}),
+        (TWO, {"command": "read_modbus_rtu_holding_registers", "data": [1]}),
         (OLD.write(2, 1, [1]), {"command": "write_single_register"}),
         (OLD.write(2, 1, [1]), {"command": "write_single_register", "write_state": 1}),
         (OLD.write(2, 1, [1]), {"state": "current_trajectory_state", "write_state": True}),
     ],
 )
-def test_what_does_not(step: Any, reply: dict[str, Any]) -> None:
-    assert not step.answers(reply)
+def test_what_does_not(command: Any, reply: dict[str, Any]) -> None:
+    assert not command.answers(reply)
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_generations(reply: dict[str, Any], generation: int | None) -> None:
 def test_lines_come_out_as_they_went_in_however_they_are_cut(messages: list[dict[str, Any]], data: st.DataObject) -> None:
     stream = b"".join(map(encode, messages))
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    lines = Lines()
-    found = [
+    lines = JsonLines()
+    result = [
         message for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True) for message in lines.feed(stream[start:end])
     ]
-    assert found == messages
+    assert result == messages
     assert (lines.skipped, lines.pending) == (0, 0)
 
 
@@ -149,11 +149,11 @@ def test_lines_come_out_as_they_went_in_however_they_are_cut(messages: list[dict
     ],
 )
 def test_what_is_no_line_is_skipped_and_the_next_is_heard(line: bytes) -> None:
-    lines = Lines()
-    found = []
+    lines = JsonLines()
+    result = []
     for at in range(0, len(line), 1000):
-        found += lines.feed(line[at : at + 1000])
+        result += lines.feed(line[at : at + 1000])
         assert lines.pending <= MAX_LINE + 1000
-    assert found == []
+    assert result == []
     assert lines.feed(b'{"a":1}\r\n') == [{"a": 1}]
     assert lines.skipped == 1

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
-from servobus.protocols.modbus.codec import Frame, ModbusCodec, encode, pack, words
+from servobus.protocols.modbus.codec import Frame, ModbusCodec, encode, pack, unpack
 from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.model import CHANNELS
 from servobus.protocols.roh.model_loading import load_models, packaged_models
@@ -140,9 +140,9 @@ def hand_of(name: str = "v2", unit: int = 2) -> RohDevice:
     return RohDevice(packaged_models()[name], unit)
 
 
-def tell(hand: RohDevice, function: int, body: bytes, *, to: int | None = None, now: float = 0.0) -> Frame | None:
+def tell(hand: RohDevice, function: int, data: bytes, *, to: int | None = None, now: float = 0.0) -> Frame | None:
     """What the hand answers, if it does."""
-    replies = hand.handle(question(encode(hand.node if to is None else to, function, body)), now)
+    replies = hand.handle(question(encode(hand.node if to is None else to, function, data)), now)
     assert len(replies) <= 1
     return answer(replies[0].data) if replies else None
 
@@ -151,17 +151,17 @@ def look(hand: RohDevice, address: int, count: int = 1, *, now: float = 0.0) -> 
     """What is read there; an exception is an empty list."""
     reply = tell(hand, 3, pack((address, count)), now=now)
     assert reply is not None
-    return words(reply.body[1:])
+    return unpack(reply.data[1:])
 
 
 def put(hand: RohDevice, address: int, values: Sequence[int] | int, *, now: float = 0.0, to: int | None = None) -> int | None:
     """0: taken; else the exception; None: no answer."""
     some = [values] if isinstance(values, int) else list(values)
-    body = pack((address, len(some))) + bytes((2 * len(some),)) + pack(some)
-    reply = tell(hand, 0x10, body, now=now, to=to)
+    data = pack((address, len(some))) + bytes((2 * len(some),)) + pack(some)
+    reply = tell(hand, 0x10, data, now=now, to=to)
     if reply is None:
         return None
-    return reply.body[0] if reply.function & 0x80 else 0
+    return reply.data[0] if reply.function & 0x80 else 0
 
 
 def three_hands(**keys: Any) -> Bench:

@@ -1,7 +1,7 @@
-"""A simulated RealMan arm from the other end of the JSON lines, with whatever answers Modbus-RTU behind its ports. Sans-IO.
+"""A simulated RealMan arm: the device's end of the JSON lines, with any Modbus-RTU devices behind its ports. Sans-IO.
 
-Where the documents are silent it does this: an unknown command is not answered; a Modbus command before the mode was set, or one
-beyond the arm's register limits, fails like any other, with one bit.
+Where the documents are silent: an unknown command is not answered. A Modbus command before the mode was set, or beyond the arm's
+register limits, fails like any other failure: one bit in the reply.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from servobus.protocols.modbus.codec import REFUSED, Function, ModbusCodec, encode, pack, words
-from servobus.protocols.realman.codec import TOOL, WHO, WHO_2, WHO_2_ANSWER, WHO_ANSWER, Message
+from servobus.protocols.modbus.codec import REFUSED, Function, ModbusCodec, encode, pack, unpack
+from servobus.protocols.realman.codec import INFO, INFO_REPLY, TOOL, VERSION, VERSION_REPLY, Message
 
 Exchange = Callable[[bytes], bytes | None]
-"""A Modbus-RTU question -> its answer; None: nobody answers."""
+"""Modbus-RTU request -> its reply; None: no unit answers."""
 JOINTS = 6
-VERSION = {"build_time": "2024/01/01 00:00:00", "commit_id": "0000000", "version": "V1.0.0"}
+BUILD = {"build_time": "2024/01/01 00:00:00", "commit_id": "0000000", "version": "V1.0.0"}
 
 
 class SimulatedArm:
@@ -24,41 +24,42 @@ class SimulatedArm:
     def __init__(self, exchange: Exchange, generation: int = 3) -> None:
         self.generation = generation
         self.modes: dict[int, int] = {}
-        """Port -> baud rate, where it is a Modbus master."""
+        """Port -> baud rate, of the ports that are a Modbus master."""
         self.voltage = 0
+        """The arm's code of the supply at the tool."""
         self.refuses_modes = False
         self._exchange = exchange
-        self._verbs: Mapping[str, Callable[[Message], Message | None]] = VERBS_4 if generation >= 4 else VERBS_3
+        self._handlers: Mapping[str, Callable[[Message], Message | None]] = HANDLERS_4 if generation >= 4 else HANDLERS_3
 
     def handle(self, message: Message) -> Message | None:
-        """The reply, if it is one that the arm answers."""
+        """Return the reply to one message; None where the arm does not answer."""
         command = message.get("command")
         if not isinstance(command, str):
             return None
-        if command in self._verbs:
+        if command in self._handlers:
             try:
-                return self._verbs[command](self, message)  # type: ignore[call-arg, arg-type]
+                return self._handlers[command](self, message)  # type: ignore[call-arg, arg-type]
             except (KeyError, TypeError, ValueError):
-                return {"command": command, _state(command): False}
-        return self._self_portrait(command)
+                return {"command": command, _result_key(command): False}
+        return self._describe_itself(command)
 
-    def _self_portrait(self, command: str) -> Message | None:
-        if command == WHO_2["command"]:
-            return {"state": WHO_2_ANSWER, "Product_version": "RM65", "Plan_version": "v1.0.0"}
-        if self.generation == 2 and command == WHO["command"]:
+    def _describe_itself(self, command: str) -> Message | None:
+        if command == VERSION["command"]:
+            return {"state": VERSION_REPLY, "Product_version": "RM65", "Plan_version": "v1.0.0"}
+        if self.generation == 2 and command == INFO["command"]:
             return None
-        if command == WHO["command"]:
-            newest = {"robot_controller_version": "4.0"} if self.generation >= 4 else {}
+        if command == INFO["command"]:
+            generation_4 = {"robot_controller_version": "4.0"} if self.generation >= 4 else {}
             return {
-                "command": WHO_ANSWER,
+                "command": INFO_REPLY,
                 "Product_version": "RM65-BI",
                 "algorithm_info": {"version": "1.0.0"},
-                "ctrl_info": VERSION,
+                "ctrl_info": BUILD,
                 "dynamic_info": {"model_version": "1"},
-                "plan_info": VERSION,
-                **newest,
+                "plan_info": BUILD,
+                **generation_4,
             }
-        return PORTRAIT.get(command)
+        return DESCRIPTION.get(command)
 
     # Modes
 
@@ -81,65 +82,65 @@ class SimulatedArm:
     # Registers, generations 2 and 3
 
     def read_one(self, message: Message) -> Message:
-        found = self._read(message, int(message["port"]), 1)
-        return self._told(message, "read_state", None if found is None else found[0])
+        registers = self._read(message, int(message["port"]), 1)
+        return self._read_reply(message, None if registers is None else registers[0])
 
-    def read_some(self, message: Message) -> Message:
+    def read_several(self, message: Message) -> Message:
         count = int(message["num"])
-        found = self._read(message, int(message["port"]), count) if count <= 12 else None
-        return self._told(message, "read_state", None if found is None else list(pack(found)))
+        registers = self._read(message, int(message["port"]), count) if count <= 12 else None
+        return self._read_reply(message, None if registers is None else list(pack(registers)))
 
     def write_one(self, message: Message) -> Message:
         return self._write(message, int(message["port"]), [int(message["data"])])
 
-    def write_some(self, message: Message) -> Message:
+    def write_several(self, message: Message) -> Message:
         count = int(message["num"])
-        values = words(bytes(message["data"]))
+        values = unpack(bytes(message["data"]))
         if count > 10 or len(values) != count:
             raise ValueError
         return self._write(message, int(message["port"]), values)
 
     # Registers, generation 4
 
-    def read_words(self, message: Message) -> Message:
+    def read_registers(self, message: Message) -> Message:
         count = int(message["num"])
-        return self._told(message, "read_state", self._read(message, int(message["type"]), count) if count <= 100 else None)
+        return self._read_reply(message, self._read(message, int(message["type"]), count) if count <= 100 else None)
 
-    def write_words(self, message: Message) -> Message:
+    def write_registers(self, message: Message) -> Message:
         return self._write(message, int(message["type"]), [int(value) for value in message["data"]])
 
-    # The wire behind it
+    # The line behind a port
 
     def _read(self, message: Message, port: int, count: int) -> list[int] | None:
-        body = self._ask(message, port, Function.READ_HOLDING, pack((int(message["address"]), count)))
-        return None if body is None else words(body[1:])
+        data = self._ask(message, port, Function.READ_HOLDING, pack((int(message["address"]), count)))
+        return None if data is None else unpack(data[1:])
 
     def _write(self, message: Message, port: int, values: list[int]) -> Message:
-        told = pack((int(message["address"]), len(values)))
-        body = self._ask(message, port, Function.WRITE_MULTIPLE, told + bytes((2 * len(values),)) + pack(values))
-        return {"command": message["command"], "write_state": body is not None}
+        span = pack((int(message["address"]), len(values)))
+        data = self._ask(message, port, Function.WRITE_MULTIPLE, span + bytes((2 * len(values),)) + pack(values))
+        return {"command": message["command"], "write_state": data is not None}
 
-    def _ask(self, message: Message, port: int, function: int, body: bytes) -> bytes | None:
-        """What follows the function of the answer; None: no answer, an exception, or no Modbus on that port."""
+    def _ask(self, message: Message, port: int, function: int, data: bytes) -> bytes | None:
+        """Return the data of the Modbus reply; None for no reply, an exception, or a port that is not a Modbus master."""
         if port not in self.modes:
             return None
-        answer = self._exchange(encode(int(message["device"]), function, body))
+        answer = self._exchange(encode(int(message["device"]), function, data))
         codec = ModbusCodec("master")
         codec.receive_data(answer or b"")
         reply = codec.next_reply()
-        return None if reply is None or reply.function & REFUSED else reply.body
+        return None if reply is None or reply.function & REFUSED else reply.data
 
     @staticmethod
-    def _told(message: Message, state: str, data: Any) -> Message:
-        return {"command": message["command"], **({state: False} if data is None else {"data": data})}
+    def _read_reply(message: Message, data: Any) -> Message:
+        return {"command": message["command"], **({"read_state": False} if data is None else {"data": data})}
 
 
-def _state(command: str) -> str:
+def _result_key(command: str) -> str:
     return "write_state" if command.startswith("write") else "read_state" if command.startswith("read") else "set_state"
 
 
 _six: list[int] = [0] * JOINTS
-PORTRAIT: dict[str, Message] = {
+DESCRIPTION: dict[str, Message] = {
     "get_realtime_push": {
         "command": "get_realtime_push",
         "cycle": 5,
@@ -164,21 +165,21 @@ PORTRAIT: dict[str, Message] = {
     "get_joint_max_speed": {"state": "joint_max_speed", "joint_speed": [180_000] * JOINTS},
     "get_DH_data": {"command": "get_DH_data", **{f"joint_{number}": [0, 0, 0, 0] for number in range(1, JOINTS + 1)}},
 }
-"""What a client asks an arm before it believes that it is one."""
+"""Command -> reply, for what the vendor's client asks when it connects."""
 
-VERBS_3: dict[str, Callable[..., Message]] = {
+HANDLERS_3: dict[str, Callable[..., Message]] = {
     "set_tool_voltage": SimulatedArm.set_voltage,
     "set_modbus_mode": SimulatedArm.set_mode,
     "close_modbus_mode": SimulatedArm.close_mode,
     "read_holding_registers": SimulatedArm.read_one,
-    "read_multiple_holding_registers": SimulatedArm.read_some,
+    "read_multiple_holding_registers": SimulatedArm.read_several,
     "write_single_register": SimulatedArm.write_one,
-    "write_registers": SimulatedArm.write_some,
+    "write_registers": SimulatedArm.write_several,
 }
-VERBS_4: dict[str, Callable[..., Message]] = {
+HANDLERS_4: dict[str, Callable[..., Message]] = {
     "set_tool_voltage": SimulatedArm.set_voltage,
     "set_tool_rs485_mode": SimulatedArm.set_mode,
     "set_controller_rs485_mode": SimulatedArm.set_controller_mode,
-    "read_modbus_rtu_holding_registers": SimulatedArm.read_words,
-    "write_modbus_rtu_registers": SimulatedArm.write_words,
+    "read_modbus_rtu_holding_registers": SimulatedArm.read_registers,
+    "write_modbus_rtu_registers": SimulatedArm.write_registers,
 }

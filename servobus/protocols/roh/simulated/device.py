@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from servobus.protocols.base import DeviceReply
-from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame, Function, encode, pack, words
+from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame, Function, encode, pack, unpack
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.model_loading import NEWEST
 from servobus.protocols.roh.options import RohBus
@@ -68,25 +68,25 @@ class RohDevice(SimulatedHand):
         verb = VERBS.get(packet.function)
         if verb is None:
             raise Refusal(ILLEGAL_FUNCTION)
-        return verb(self, packet.body)
+        return verb(self, packet.data)
 
-    def read(self, body: bytes) -> bytes:
-        address, count = words(body)
+    def read(self, data: bytes) -> bytes:
+        address, count = unpack(data)
         self._require_count(count)
         found = pack([self.look(place) for place in range(address, address + count)])
         return bytes((len(found),)) + found
 
-    def write_single(self, body: bytes) -> bytes:
-        address, word = words(body)
+    def write_single(self, data: bytes) -> bytes:
+        address, word = unpack(data)
         self.write(address, word)
-        return body
+        return data
 
-    def write_multiple(self, body: bytes) -> bytes:
-        address, count = words(body[:4])
+    def write_multiple(self, data: bytes) -> bytes:
+        address, count = unpack(data[:4])
         self._require_count(count)
-        for place, word in enumerate(words(body[5:]), address):
+        for place, word in enumerate(unpack(data[5:]), address):
             self.write(place, word)
-        return body[:4]
+        return data[:4]
 
     def _require_count(self, count: int) -> None:
         if not 1 <= count <= self.max_registers:

@@ -8,7 +8,7 @@ import pytest
 
 from servobus.protocols.modbus.codec import ModbusCodec
 from servobus.protocols.realman.codec import dialect
-from servobus.protocols.realman.simulated.arm import PORTRAIT, SimulatedArm
+from servobus.protocols.realman.simulated.arm import DESCRIPTION, SimulatedArm
 from servobus.protocols.roh.simulated.device import RohDevice
 from tests.protocols.roh.bench import hand_of
 
@@ -16,9 +16,9 @@ from tests.protocols.roh.bench import hand_of
 def arm_of(generation: int = 3, hand: RohDevice | None = None) -> SimulatedArm:
     behind = hand or hand_of()
 
-    def exchange(question: bytes) -> bytes | None:
+    def exchange(request: bytes) -> bytes | None:
         codec = ModbusCodec("device")
-        codec.receive_data(question)
+        codec.receive_data(request)
         frame = codec.next_reply()
         assert frame is not None
         replies = behind.handle(frame, 0.0)
@@ -35,7 +35,7 @@ def arm_of(generation: int = 3, hand: RohDevice | None = None) -> SimulatedArm:
 def test_registers_both_ways(generation: int) -> None:
     hand = hand_of()
     arm, say = arm_of(generation, hand), dialect(generation, 1)
-    for step, words in (
+    for command, registers in (
         (say.write(2, 1135, [100, 200]), []),
         (say.read(2, 1135, 2), [100, 200]),
         (say.write(2, 1126, [7]), []),
@@ -44,10 +44,10 @@ def test_registers_both_ways(generation: int) -> None:
         (say.read(9, 1135, 1), None),
         (say.write(2, 1001, [7]), None),
     ):
-        reply = arm.handle(step.message)
+        reply = arm.handle(command.message)
         assert reply is not None
-        assert step.answers(reply)
-        assert step.words(reply) == words
+        assert command.answers(reply)
+        assert command.registers(reply) == registers
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_the_old_commands_are_not_known_to_the_new_arm_nor_the_other_way_round()
 
 def test_its_portrait() -> None:
     arm = arm_of()
-    assert all(arm.handle({"command": command}) == reply for command, reply in PORTRAIT.items())
+    assert all(arm.handle({"command": command}) == reply for command, reply in DESCRIPTION.items())
     assert (arm_of(2).handle({"command": "get_arm_software_info"})) is None
     assert (arm_of(2).handle({"command": "get_arm_software_version"}) or {})["state"] == "arm_software_version"
     newest = arm_of(4).handle({"command": "get_arm_software_info"})

@@ -36,7 +36,7 @@ def test_exceptions() -> None:
     assert look(hand, 1020, 9) == []
     single = tell(hand, 6, pack((1125, 9)))
     assert single is not None
-    assert single.body == pack((1125, 9))
+    assert single.data == pack((1125, 9))
 
 
 def test_what_a_register_cannot_take_is_invalid_data() -> None:
