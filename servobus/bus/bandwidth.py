@@ -12,7 +12,7 @@ from typing import Any
 
 from servobus.engine.health import FIRST_DEADLINE
 from servobus.engine.line import QUIET
-from servobus.protocols.base import Driver, LineTraits, Request, run_plan
+from servobus.protocols.base import Driver, LineTraits, Request
 from servobus.protocols.options import BusOptions, ServoOptions
 from servobus.values import Goal, ServoGoal, StopTarget
 
@@ -41,7 +41,8 @@ class Bandwidth:
 def line_bandwidth(options: BusOptions, driver: Driver, traits: LineTraits) -> Bandwidth:
     """Goals of all servos at the bus's `goal_rate`, polls at theirs."""
     driver.use_traits(traits)
-    goals = _goal_requests(options, driver)
+    goals = driver.preview_goals([ServoGoal(name, _any_goal(servo), 0.0) for name, servo in options.servos.items()])
+    stop = driver.preview_stop([StopTarget(name, "hold", enabled=True, position=0.0) for name in driver.nodes])
     shares = {"goals": 100 * options.rate_of_goals * _seconds(goals, traits)}
     longest = max((_seconds([request], traits) for request in goals), default=0.0)
     polls = driver.polls(options.poll.rates())
@@ -55,7 +56,7 @@ def line_bandwidth(options: BusOptions, driver: Driver, traits: LineTraits) -> B
     return Bandwidth(
         shares,
         goal_latency=2 * longest + _seconds(goals, traits) + traits.latency,
-        estop_latency=longest + _seconds(_stop_requests(driver), traits) + traits.latency,
+        estop_latency=longest + _seconds(stop, traits) + traits.latency,
         silent_latency=silent,
     )
 
@@ -72,29 +73,6 @@ def _seconds(requests: Sequence[Request[Any]], traits: LineTraits) -> float:
     )
 
 
-def _goal_requests(options: BusOptions, driver: Driver) -> list[Request[Any]]:
-    """The frames of one goal for each servo, as they are once the servos know what does not change."""
-    goals = [ServoGoal(name, Goal("position", _somewhere(servo)), 0.0) for name, servo in options.servos.items()]
-    requests: list[Request[Any]] = []
-    for _ in range(2 if goals else 0):
-        requests.clear()
-        for turn in driver.plan_goals(goals, together=False, confirm=False):
-            run_plan(turn.plan, requests.append)
-    return requests
-
-
-def _stop_requests(driver: Driver) -> list[Request[Any]]:
-    """What an e-stop says before it waits for an answer; where nothing can be said to all at once, a turn for each node."""
-    targets = [StopTarget(name, "hold", enabled=True, position=0.0) for name in driver.nodes]
-    requests: list[Request[Any]] = []
-    plan = driver.stop(targets) if targets else iter(())
-    for request in plan:  # each step is told that its request brought nothing
-        if request.replies:
-            return requests or [request] * len(set(driver.nodes.values()))
-        requests.append(request)
-    return requests
-
-
-def _somewhere(servo: ServoOptions) -> float:
-    """A position it may have."""
-    return sum(servo.limits) / 2 if servo.limits else 0.0
+def _any_goal(servo: ServoOptions) -> Goal:
+    """A goal inside the servo's limits."""
+    return Goal("position", sum(servo.limits) / 2 if servo.limits else 0.0)

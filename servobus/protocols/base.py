@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeAlias, TypeVar
 
 from servobus.errors import DeviceError, NotSupported, ServobusError
 from servobus.values import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
@@ -172,22 +172,40 @@ class Poll:
     request: Callable[[Collection[int]], Request[dict[str, Update]] | None]
 
 
-class Commissioning(Protocol):
+class Commissioning(ABC):
     """Gives servos their ids and rates: one change at a time, read back, saved on request. For exclusive sessions."""
 
+    commands: ClassVar[Mapping[str, str]]
+    """Name of each maintenance command -> what it does to the node."""
+
+    @abstractmethod
     def set_id(self, node: int, new: int, *, save: bool = False) -> Plan[Change]:
-        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected, or `new` answers already."""
+        """Return the plan that gives a node another id.
 
+        Raises LimitError or NotSupported at once; the plan raises DeviceError where it suspects two servos with this id, or where
+        `new` answers already.
+        """
+
+    @abstractmethod
     def set_baudrate(self, node: int, baudrate: int, *, save: bool = False) -> Plan[Change]:
-        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected."""
+        """Return the plan that gives a node another baud rate.
 
-    @property
-    def commands(self) -> Mapping[str, str]:
-        """What else a node can be told, and what that does to it."""
+        Raises LimitError or NotSupported at once; the plan raises DeviceError where it suspects two servos with this id.
+        """
 
+    @abstractmethod
     def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
-        """One of `commands`, said once and never repeated; returns what a person should know. Raises UnknownName, LimitError at
-        once; then NotSupported, DeviceError."""
+        """Return the plan of one of `commands`, which is sent once and never repeated. The plan returns notes for a person.
+
+        Raises UnknownName or LimitError at once; the plan raises NotSupported or DeviceError.
+        """
+
+    def restarted(self, node: int) -> Plan[Any] | None:
+        """Return the plan that finds out what became of a change that waited for this restart; None: nothing waited.
+
+        The bus runs it when the node has restarted or is identified again.
+        """
+        return None
 
 
 class Addressing(ABC):
@@ -296,6 +314,25 @@ class Driver(Addressing, Reading, Writing, Motion, ABC):
 
     def use_traits(self, traits: LineTraits) -> None:
         """Learn what the line carries; called before the first request."""
+
+    def preview_goals(self, goals: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
+        """Return the frames that these goals take once the servos hold their settings. Changes no state, and asks nothing."""
+        requests: list[Request[Any]] = []
+        for _ in range(2 if goals else 0):
+            requests.clear()
+            for turn in self.plan_goals(goals, together=False, confirm=False):
+                run_plan(turn.plan, requests.append)
+        return requests
+
+    def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
+        """Return the frames that a stop sends before it waits for a reply; where it cannot write to several servos at once, one
+        request for each node. Changes no state, and asks nothing."""
+        requests: list[Request[Any]] = []
+        for request in self.stop(targets) if targets else ():
+            if request.replies:
+                return requests or [request] * len({self.nodes[target.servo] for target in targets})
+            requests.append(request)
+        return requests
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
+from servobus.protocols import base
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import SAVE_WORD, Command
 from servobus.protocols.kst.identity import look
@@ -22,7 +23,7 @@ DOUBTFUL_ID = 0xFF
 """The seed allows it as an address; what idle lines look like is a bad name for a servo."""
 
 
-class Commissioning:
+class Commissioning(base.Commissioning):
     """Remembers which nodes wait for a restart."""
 
     commands: ClassVar = {"save": "writes its settings to flash"}

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
+from servobus.protocols import base
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.modbus.codec import MAX_UNIT
 from servobus.protocols.modbus.requests import ReadHolding
@@ -42,7 +43,7 @@ COMMANDS = {
 """What is never repeated, and never part of a longer write."""
 
 
-class Commissioning:
+class Commissioning(base.Commissioning):
     """`hand_of`: the hand of a unit, configured or not."""
 
     commands: ClassVar = {name: command.meaning for name, command in COMMANDS.items()}
