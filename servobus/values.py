@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from typing import Any, Literal, TypeAlias
 
@@ -136,6 +136,8 @@ class ServoGoal:
     goal: Goal
     start: float | None = None
     """The last known position, for a duration that has to become a speed."""
+    packed: Any = field(default=None, compare=False, repr=False)
+    """What `Driver.check_goal` returned for this goal, so that it is not packed twice; None: it was not checked yet."""
 
 
 @dataclass(frozen=True, slots=True)

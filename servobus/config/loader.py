@@ -195,18 +195,18 @@ def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, problems
         problems.add((*here, "unit"), f"found {quote(servo.unit)}; model {model.name} has {', '.join(model.units)}")
         return
     calibration = servo.calibration(model)
-    reach = model.reach
-    if "position" in reach:
-        ends = sorted(calibration.to_unit(raw) for raw in reach["position"])
+    ranges = model.goal_ranges
+    if "position" in ranges:
+        ends = sorted(calibration.to_unit(raw) for raw in ranges["position"])
         for key, values in (("limits", servo.limits or ()), ("park_pose", [servo.park_pose])):
             for value in values:
                 if value is not None and not ends[0] <= value <= ends[1]:
                     problems.add((*here, key), f"found {value:g}; model {model.name} reaches {ends[0]:g} to {ends[1]:g}")
     greatest = {
-        "speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
-        "max_speed": abs(calibration.rate_to_unit(reach["speed"][1])) if "speed" in reach else None,
-        "acceleration": reach["acceleration"][1] * calibration.unit_per_step if "acceleration" in reach else None,
-        "torque_limit": reach["torque_limit"][1] if "torque_limit" in reach else None,
+        "speed": abs(calibration.rate_to_unit(ranges["speed"][1])) if "speed" in ranges else None,
+        "max_speed": abs(calibration.rate_to_unit(ranges["speed"][1])) if "speed" in ranges else None,
+        "acceleration": ranges["acceleration"][1] * calibration.unit_per_step if "acceleration" in ranges else None,
+        "torque_limit": ranges["torque_limit"][1] if "torque_limit" in ranges else None,
     }
     for key, most in greatest.items():
         value = getattr(servo, key)

@@ -294,8 +294,12 @@ class Motion(ABC):
         """Stop servos: first everything that can be written at once, then what needs a question."""
 
     @abstractmethod
-    def check_goal(self, goal: ServoGoal) -> None:
-        """Raise LimitError or NotSupported for what the model or the line cannot carry."""
+    def check_goal(self, goal: ServoGoal) -> Any:
+        """Raise LimitError or NotSupported for what the model or the line cannot carry.
+
+        Returns the goal packed for the wire, or None. The caller passes it on as `ServoGoal.packed`, and `plan_goals` uses it
+        unless something has changed meanwhile. It is opaque to the caller.
+        """
 
     @abstractmethod
     def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:

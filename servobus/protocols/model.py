@@ -57,15 +57,15 @@ class Register(Data):
         return self.address + self.size
 
     @property
-    def room(self) -> tuple[int, int]:
+    def capacity(self) -> tuple[int, int]:
         """Least and greatest raw value that the bytes can hold."""
         greatest = (1 << self.sign_bit) - 1 if self.sign_bit is not None else (1 << 8 * self.size) - 1
         return (-greatest if self.sign_bit is not None else 0, greatest)
 
     @property
-    def span(self) -> tuple[int, int]:
+    def raw_range(self) -> tuple[int, int]:
         """Least and greatest raw value that can be written."""
-        least, greatest = self.room
+        least, greatest = self.capacity
         return (least if self.minimum is None else self.minimum, greatest if self.maximum is None else self.maximum)
 
     def decode(self, data: bytes, byte_order: Literal["little", "big"]) -> int:
@@ -76,8 +76,8 @@ class Register(Data):
         return word
 
     def encode(self, raw: int, byte_order: Literal["little", "big"]) -> bytes:
-        """The bytes of a raw integer. Raises LimitError outside `span`."""
-        least, greatest = self.span
+        """The bytes of a raw integer. Raises LimitError outside `raw_range`."""
+        least, greatest = self.raw_range
         if not least <= raw <= greatest:
             raise LimitError(f"register {self.name}: raw value {raw} is outside {least} to {greatest}")
         word = (1 << self.sign_bit) - raw if self.sign_bit is not None and raw < 0 else raw
@@ -118,7 +118,7 @@ class ServoModel(Data):
     model_numbers: dict[int, str] = {}
 
     @property
-    def reach(self) -> dict[str, tuple[float, float]]:
+    def goal_ranges(self) -> dict[str, tuple[float, float]]:
         """What goals can carry, least and greatest: position (raw steps), speed (steps/s), acceleration (steps/s^2), torque_limit
         (%). Nothing: the model does not take it. Absent: not known here."""
         return {}

@@ -101,7 +101,7 @@ def test_registers_by_name_and_alias() -> None:
         model.writable("where")
     with pytest.raises(NotSupported, match="can only be written"):
         model.readable("command")
-    assert model.reach == {}
+    assert model.goal_ranges == {}
 
 
 @pytest.mark.parametrize(

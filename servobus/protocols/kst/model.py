@@ -27,7 +27,7 @@ class KstModel(ServoModel):
     reboot_s: Annotated[float, Field(ge=0)] = 0.5
 
     @property
-    def reach(self) -> dict[str, tuple[float, float]]:
+    def goal_ranges(self) -> dict[str, tuple[float, float]]:
         """Speed is missing because the host keeps it."""
         return {"position": self.range, "acceleration": (0.0, 0.0), "torque_limit": (0.0, 0.0)}
 

@@ -70,7 +70,7 @@ class RohRegister(Register):
 
     def word(self, raw: int) -> int:
         """Raises LimitError outside `span`."""
-        least, greatest = self.span
+        least, greatest = self.raw_range
         if not least <= raw <= greatest:
             raise LimitError(f"register {self.name}: raw value {raw} is outside {least} to {greatest}")
         return raw % WORD
@@ -97,7 +97,7 @@ class RohModel(ServoModel):
     reboot_s: float = 1.0
 
     @property
-    def reach(self) -> dict[str, tuple[float, float]]:
+    def goal_ranges(self) -> dict[str, tuple[float, float]]:
         """Speed is missing, for its steps are other ones in degrees."""
         return {"position": (0, FULL), "acceleration": (0.0, 0.0), "torque_limit": (0.0, 100.0)}
 

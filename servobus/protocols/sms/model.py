@@ -22,7 +22,7 @@ def _fits_the_table(register: Register) -> Register:
     bits = 8 * register.size
     if register.sign_bit is not None and register.sign_bit >= bits:
         raise ValueError(f"found sign_bit {register.sign_bit}; its {register.size} bytes have bits 0 to {bits - 1}")
-    (least, greatest), (low, high) = register.room, register.span
+    (least, greatest), (low, high) = register.capacity, register.raw_range
     if not least <= low <= high <= greatest:
         raise ValueError(f"found values {low} to {high}; it can hold {least} to {greatest}")
     if register.default is not None and not least <= register.default <= greatest:
@@ -79,14 +79,14 @@ class SmsModel(ServoModel):
         return ("position", "velocity") if self.wheel else ("position",)
 
     @property
-    def reach(self) -> dict[str, tuple[float, float]]:
+    def goal_ranges(self) -> dict[str, tuple[float, float]]:
         position, _, speed = self.goal
         names = {"position": position, "speed": speed, "acceleration": "acceleration", "torque_limit": "torque_limit"}
-        return {part: self._reach_of(self.registers.get(name)) for part, name in names.items()}
+        return {part: self._goal_range(self.registers.get(name)) for part, name in names.items()}
 
     @staticmethod
-    def _reach_of(register: Register | None) -> tuple[float, float]:
-        least, greatest = register.span if register else (0, 0)
+    def _goal_range(register: Register | None) -> tuple[float, float]:
+        least, greatest = register.raw_range if register else (0, 0)
         return (least * register.scale, greatest * register.scale) if register else (0.0, 0.0)
 
     @model_validator(mode="after")

@@ -132,8 +132,8 @@ def test_what_requests_take_from_the_options() -> None:
 def test_the_packaged_model_is_found_once_for_all_servos() -> None:
     models = load_models(bus_options(), Path())
     assert dict(models) == {"kst": packaged_model()}
-    assert packaged_model().reach["position"] == (-900, 900)
-    assert packaged_model().reach["acceleration"] == packaged_model().reach["torque_limit"] == (0.0, 0.0)
+    assert packaged_model().goal_ranges["position"] == (-900, 900)
+    assert packaged_model().goal_ranges["acceleration"] == packaged_model().goal_ranges["torque_limit"] == (0.0, 0.0)
 
 
 def test_an_own_model_stands_beside_the_config(tmp_path: Path) -> None:

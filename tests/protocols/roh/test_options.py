@@ -201,4 +201,4 @@ def test_which_maps_fit_what_a_hand_says() -> None:
         for words in ((0x0100, 0x0301), (0x0200, 0x0301), (0x0300, 68), (0x0100, 0x0201), (0x0100,), (0x0400, 0x0301))
     }
     assert list(fits.values()) == [["v1"], ["v2"], ["legacy"], [], ["v1"], []]
-    assert packaged_models()["v1"].reach["torque_limit"] == (0.0, 100.0)
+    assert packaged_models()["v1"].goal_ranges["torque_limit"] == (0.0, 100.0)

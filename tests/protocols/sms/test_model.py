@@ -16,7 +16,7 @@ def with_keys(**keys: Any) -> SmsModel:
 
 
 @pytest.mark.parametrize(
-    ("family", "reach"),
+    ("family", "ranges"),
     [
         (
             "sts",
@@ -31,8 +31,8 @@ def with_keys(**keys: Any) -> SmsModel:
         ("sms_cl", {"position": (-32767, 32767), "speed": (-32767, 32767), "acceleration": (0, 25_400), "torque_limit": (0, 0)}),
     ],
 )
-def test_what_goals_can_carry(family: str, reach: dict[str, tuple[float, float]]) -> None:
-    assert model_of(family).reach == reach
+def test_what_goals_can_carry(family: str, ranges: dict[str, tuple[float, float]]) -> None:
+    assert model_of(family).goal_ranges == ranges
 
 
 @pytest.mark.parametrize(("family", "feedback", "health"), [("sts", (56, 11), (56, 15)), ("scs", (56, 11), (56, 11))])
@@ -49,7 +49,7 @@ def test_the_sentinel_shows_a_restart(family: str) -> None:
     register = model.registers[model.sentinel.name]
     assert model.sentinel.value != model.sentinel.reset
     assert register.memory == "ram"
-    least, greatest = register.span
+    least, greatest = register.raw_range
     assert least <= model.sentinel.reset <= greatest
     assert least <= model.sentinel.value <= greatest
     assert (register.default or 0) == model.sentinel.reset

@@ -111,7 +111,7 @@ REGISTERS = [(model.byte_order, register) for model in packaged_models().values(
 
 @pytest.mark.parametrize(("order", "register"), REGISTERS, ids=lambda value: getattr(value, "name", value))
 def test_every_register_holds_its_edges(order: Literal["little", "big"], register: Register) -> None:
-    least, greatest = register.span
+    least, greatest = register.raw_range
     for raw in {least, greatest, max(least, 0)}:
         assert register.decode(register.encode(raw, order), order) == raw
     for raw in (least - 1, greatest + 1):
@@ -156,7 +156,7 @@ PHYSICAL = [
 
 @pytest.mark.parametrize(("model", "name", "span"), SPANS, ids=str)
 def test_what_may_be_written(model: str, name: str, span: tuple[int, int]) -> None:
-    assert packaged_models()[model].registers[name].span == span
+    assert packaged_models()[model].registers[name].raw_range == span
 
 
 @pytest.mark.parametrize(("model", "name", "raw", "physical"), PHYSICAL, ids=str)
@@ -170,7 +170,7 @@ def test_scales(model: str, name: str, raw: int, physical: float) -> None:
 def test_codes_of_baud_rates_are_the_vendors(model: str) -> None:
     register = packaged_models()[model].registers["baud_rate"]
     assert [register.to_physical(code) for code in range(12)] == BAUD_RATES
-    assert register.span == (0, 7)
+    assert register.raw_range == (0, 7)
 
 
 @pytest.mark.parametrize(

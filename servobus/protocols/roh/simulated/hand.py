@@ -109,7 +109,7 @@ class SimulatedHand:
         if address >= SYSTEM_END:
             self._require_work()
         raw = register.raw(word)
-        if not register.span[0] <= raw <= register.span[1]:
+        if not register.raw_range[0] <= raw <= register.raw_range[1]:
             raise Refusal(DEVICE_FAILURE, INVALID)
         self.written.append((address, word))
         self._memory[address] = word
