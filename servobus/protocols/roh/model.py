@@ -47,7 +47,7 @@ class RohRegister(Register):
     """Never written by name: the commissioning verb that does it."""
 
     @property
-    def span(self) -> tuple[int, int]:
+    def raw_range(self) -> tuple[int, int]:
         least, greatest = (-WORD // 2, WORD // 2 - 1) if self.signed else (0, FULL)
         return (least if self.minimum is None else self.minimum, greatest if self.maximum is None else self.maximum)
 
@@ -69,7 +69,7 @@ class RohRegister(Register):
         return word - WORD if self.signed and word >= WORD // 2 else word
 
     def word(self, raw: int) -> int:
-        """Raises LimitError outside `span`."""
+        """Raises LimitError outside `raw_range`."""
         least, greatest = self.raw_range
         if not least <= raw <= greatest:
             raise LimitError(f"register {self.name}: raw value {raw} is outside {least} to {greatest}")
