@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from servobus.errors import (
     AccessDenied,
     ActionWithheld,
+    Busy,
     ConfigError,
     DeviceError,
     EchoMismatch,
     EStopped,
     GoalExpired,
+    InvalidRequest,
     LeaseHeld,
     LimitError,
     LinkDown,
@@ -26,6 +28,7 @@ from servobus.errors import (
     PortMissing,
     ReplyTimeout,
     ServobusError,
+    SettleTimeout,
     UnknownName,
 )
 from servobus.rig.events import Event
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AccessDenied",
     "ActionWithheld",
+    "Busy",
     "Change",
     "ConfigError",
     "DeviceError",
@@ -51,6 +55,7 @@ __all__ = [
     "Goal",
     "GoalExpired",
     "Identity",
+    "InvalidRequest",
     "LeaseHeld",
     "LimitError",
     "LinkDown",
@@ -69,6 +74,7 @@ __all__ = [
     "Rig",
     "Servo",
     "ServobusError",
+    "SettleTimeout",
     "Snapshot",
     "State",
     "StopReport",

@@ -1,19 +1,37 @@
-"""One tree of everything that can go wrong, for every floor and every door.
+"""One tree of everything that can go wrong, for every package and every door.
 
-Each error carries where it happened (`bus`, `servo`), what was asked (`request`) and what was on the wire (`raw`). Its message
-ends with the next step. Exit statuses of the command line hang on the class: see `exit_status`.
+An error is immutable: its attributes cannot be set once it is made. `error.at(bus=, servo=)` makes a new one that also says where
+it happened. The message ends with the next step. The exit status of the command line follows from the class (`exit_status`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn, Self, TypeVar
+
+E = TypeVar("E", bound="ServobusError")
 
 
 class ServobusError(Exception):
-    """The root: catch this to catch whatever servobus raises on purpose."""
+    """The root of the tree: catch it to catch whatever servobus raises on purpose.
+
+    Args:
+        message: What happened, what was expected, and what to do next.
+        bus: Name of the bus, where it is known.
+        servo: Name of the servo, where it is known.
+        request: The request that failed, where there was one.
+        raw: The bytes on the wire that the error is about.
+
+    Attributes: message, bus, servo, request, raw (as the arguments); exit_status (class attribute, for the command line).
+    """
 
     exit_status = 1
+
+    message: str
+    bus: str | None
+    servo: str | None
+    request: object
+    raw: bytes
 
     def __init__(
         self,
@@ -25,31 +43,59 @@ class ServobusError(Exception):
         raw: bytes = b"",
     ) -> None:
         super().__init__(message)
-        self.message = message
-        self.bus = bus
-        self.servo = servo
-        self.request = request
-        self.raw = raw
+        self.__dict__.update(message=message, bus=bus, servo=servo, request=request, raw=raw)
 
     def __str__(self) -> str:
         where = "/".join(part for part in (self.bus, self.servo) if part)
         return f"{where}: {self.message}" if where else self.message
 
-    def at(self, *, bus: str | None = None, servo: str | None = None) -> ServobusError:
-        """Add the place where a higher floor knows it; what is already known stays."""
-        self.bus = self.bus or bus
-        self.servo = self.servo or servo
-        return self
+    def __setattr__(self, name: str, value: object) -> None:
+        if not name.startswith("__"):  # Python itself sets __traceback__, __context__, __notes__
+            self._refuse(name)
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        self._refuse(name)
+
+    def _refuse(self, name: str) -> NoReturn:
+        raise AttributeError(f"{type(self).__name__}.{name}: an error is immutable, `at` makes a new one")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _copy, (type(self), self.args, self.__dict__)
+
+    def at(self, *, bus: str | None = None, servo: str | None = None) -> Self:
+        """Make a new error that also says where it happened.
+
+        Args:
+            bus: Name of the bus; one that is known already is kept.
+            servo: Name of the servo; one that is known already is kept.
+
+        Returns:
+            An error of the same class, with the same message, cause and traceback.
+        """
+        error = _copy(type(self), self.args, {**self.__dict__, "bus": self.bus or bus, "servo": self.servo or servo})
+        error.__cause__, error.__context__ = self.__cause__, self.__context__
+        error.__suppress_context__ = self.__suppress_context__
+        return error.with_traceback(self.__traceback__)
+
+
+def _copy(kind: type[E], args: tuple[Any, ...], attributes: dict[str, Any]) -> E:
+    """An error with exactly these attributes, whatever arguments its class takes."""
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    if "__notes__" in attributes:
+        error.__dict__["__notes__"] = list(attributes["__notes__"])
+    return error
 
 
 class ConfigError(ServobusError):
-    """A file or an option that cannot be used. The message begins with `file:line:column`."""
+    """A file or an option cannot be used. Where a file is at fault, the message begins with `file:line:column`."""
 
     exit_status = 2
 
 
 class UnknownName(ServobusError):
-    """A bus, servo, register or model of that name does not exist, or the bare name stands for several."""
+    """No bus, servo, register, command or model has this name, or several servos share the bare name."""
 
     exit_status = 2
 
@@ -60,16 +106,28 @@ class NotSupported(ServobusError):
     exit_status = 2
 
 
+class InvalidRequest(ServobusError):
+    """The call contradicts itself or is too long: a servo is named twice, say. Nothing was sent."""
+
+    exit_status = 2
+
+
+class LimitError(ServobusError):
+    """A value is outside a limit, not finite, or not a number. Nothing was sent."""
+
+    exit_status = 2
+
+
 class LinkDown(ServobusError):
-    """The line is not there now: nothing was sent, or what was in flight may or may not have been applied."""
+    """The line, or the connection to the daemon, is not open. A request that was under way may have been applied."""
 
 
 class PortMissing(LinkDown):
-    """The device file does not exist or is no serial port."""
+    """The device file does not exist or is not a serial port."""
 
 
 class PortBusy(LinkDown):
-    """Another process holds the port; the message names it where the system tells."""
+    """Another process holds the port. The message names the process where the system tells it."""
 
 
 class PortDenied(LinkDown):
@@ -80,26 +138,34 @@ class ReplyTimeout(ServobusError):
     """No acceptable reply came within the deadline, or the servo is offline. A write may have been applied."""
 
 
+class SettleTimeout(ReplyTimeout):
+    """The servo did not reach its goal in time. The message says where it is and where it was to go."""
+
+
 class DeviceError(ServobusError):
-    """The device answered that it did not do what was asked."""
+    """The device answered that it did not do what was asked.
+
+    Args:
+        message: As in ServobusError.
+        code: The number that the device gave: a status byte, an abort code or an exception code; None: it gave none.
+        where: bus, servo, request and raw, as in ServobusError.
+
+    Attributes: those of ServobusError, and code.
+    """
+
+    code: int | None
 
     def __init__(self, message: str, *, code: int | None = None, **where: Any) -> None:
         super().__init__(message, **where)
-        self.code = code
+        self.__dict__["code"] = code
 
 
 class EchoMismatch(ServobusError):
     """The device confirmed another value than the one sent."""
 
 
-class LimitError(ServobusError):
-    """The value is outside a limit, not finite, or no number. Nothing was sent."""
-
-    exit_status = 2
-
-
 class NotEnabled(ServobusError):
-    """The servo is not enabled (or was disabled because it rebooted). Nothing was sent."""
+    """The servo is not enabled, or lost its torque because it restarted. Nothing was sent."""
 
 
 class EStopped(ServobusError):
@@ -107,11 +173,15 @@ class EStopped(ServobusError):
 
 
 class LeaseHeld(ServobusError):
-    """Another client, or an exclusive session, holds motion here. Nothing was sent."""
+    """Another client holds the motion lease of the servo. Nothing was sent."""
+
+
+class Busy(ServobusError):
+    """The bus or the rig is in use by a scan, commissioning, a reload, a stop or enabled servos. Nothing was sent."""
 
 
 class AccessDenied(ServobusError):
-    """Your role does not allow that, or the token is not right. Nothing was done."""
+    """The client's role does not allow this, or its token is wrong. Nothing was done."""
 
 
 class Overloaded(ServobusError):
@@ -119,7 +189,7 @@ class Overloaded(ServobusError):
 
 
 class GoalExpired(ServobusError):
-    """The goal's time to live passed before its first byte could leave. Nothing was sent."""
+    """The first byte of the goal could not leave within its `start_within`. Nothing was sent."""
 
 
 class ActionWithheld(ServobusError):
@@ -127,10 +197,23 @@ class ActionWithheld(ServobusError):
 
 
 class PartialFailure(ServobusError):
-    """Some servos did it and some did not: `results` maps each name to its outcome or its error."""
+    """Some servos did what was asked and some did not.
+
+    Args:
+        results: The outcome or the error of each servo, by name.
+        where: bus, servo, request and raw, as in ServobusError.
+
+    Attributes: those of ServobusError, and results.
+    """
+
+    results: dict[str, Any]
 
     def __init__(self, results: Mapping[str, Any], **where: Any) -> None:
-        self.results = dict(results)
-        failed = {name: result for name, result in self.results.items() if isinstance(result, Exception)}
-        listing = "; ".join(f"{name}: {getattr(error, 'message', error)}" for name, error in failed.items())
-        super().__init__(f"{len(failed)} of {len(self.results)} failed: {listing}", **where)
+        causes: dict[str, list[str]] = {}
+        for name, result in results.items():
+            if isinstance(result, Exception):
+                causes.setdefault(str(getattr(result, "message", result)), []).append(name)
+        failed = sum(map(len, causes.values()))
+        listing = "; ".join(f"{', '.join(names)}: {cause}" for cause, names in causes.items())
+        super().__init__(f"{failed} of {len(results)} failed: {listing}", **where)
+        self.__dict__["results"] = dict(results)

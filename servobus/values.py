@@ -9,9 +9,57 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 from servobus.errors import UnknownName
+
+
+class Described(StrEnum):
+    """A string enum whose members say in one sentence what they mean: `NAME = "name", "One sentence."`."""
+
+    description: str
+
+    def __new__(cls, value: str, description: str = "") -> Self:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.description = description
+        return member
+
+
+class EventName(StrEnum):
+    """Every event of a rig: `NAME = "name", "One sentence.", "its fields"`."""
+
+    description: str
+    fields: tuple[str, ...]
+    """What `Event.fields` holds."""
+
+    def __new__(cls, value: str, description: str = "", fields: str = "") -> Self:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.description = description
+        member.fields = tuple(fields.split())
+        return member
+
+    LINE_UP = "line_up", "The line of a bus was opened.", "bus port"
+    LINE_DOWN = "line_down", "The line of a bus ended: its port is gone or its connection broke.", "bus port"
+    WAITING_FOR_PORT = "waiting_for_port", "The port cannot be opened for this reason, and is tried again.", "bus port reason"
+    ECHO_PROBED = "echo_probed", "The bus found out whether the line echoes what it sends.", "bus echo"
+    SERVO_ONLINE = "servo_online", "The node answers again.", "bus servo id"
+    SERVO_DOUBTFUL = "servo_doubtful", "A reply of the node is missing or came unasked.", "bus servo id"
+    SERVO_OFFLINE = "servo_offline", "The node missed several replies in a row.", "bus servo id"
+    SERVO_MISSING = "servo_missing", "A configured node did not answer when the line was opened.", "bus servo id reason"
+    SERVO_NOTE = "servo_note", "A setting of the servo does not fit the config.", "bus servo note"
+    SERVO_RESTARTED = "servo_restarted", "The servo restarted: it lost its torque and its volatile settings.", "bus servo id"
+    MOTION_CUT = "motion_cut", "Motion that was under way was ended.", "bus servo reason"
+    GOAL_CLAMPED = "goal_clamped", "A goal was moved to the limit (`on_limit: clamp`).", "bus servo asked applied"
+    PARK_UNCONFIRMED = "park_unconfirmed", "A servo was to be parked, and it is not confirmed that it was.", "bus servo detail"
+    EXIT_UNCONFIRMED = "exit_unconfirmed", "What `on_exit` asks for is not confirmed.", "bus servo action detail"
+    ESTOP = "estop", "The e-stop was asked for; it is latched.", ""
+    ESTOP_CLEARED = "estop_cleared", "The e-stop was released.", ""
+    RELOADED = "reloaded", "The config was read again: these buses are new, changed or gone.", "added changed removed"
+    LEASE_LOST = "lease_lost", "A client lost its motion leases; its servos do their `on_lost_client`.", "client servos reason"
+    DAEMON_LOST = "daemon_lost", "The connection to the daemon ended (seen by this client alone).", "reason"
+    DAEMON_BACK = "daemon_back", "The connection to the daemon is back (seen by this client alone).", ""
 
 
 class Outcome(StrEnum):

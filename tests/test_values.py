@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servobus.values import Calibration, Change, is_number
+from servobus.values import Calibration, Change, Described, EventName, is_number
 
 PLAIN = Calibration(zero=2048, direction=1, unit_per_step=0.5)
 TURNED = Calibration(zero=100, direction=-1, unit_per_step=0.25)
@@ -71,3 +71,19 @@ def test_what_is_a_number(value: object, number: bool) -> None:
 @pytest.mark.parametrize(("saved", "step"), [(False, "save and restart the servo"), (True, "restart the servo")])
 def test_a_change_says_what_is_still_to_do(saved: bool, step: str) -> None:
     assert str(Change(1, "id", 5, saved=saved)) == f"pending_reboot: id 5 is set and not in effect yet: {step}"
+
+
+class Fruit(Described):
+    APPLE = "apple", "It keeps all winter."
+
+
+def test_a_described_enum_is_a_string_with_a_sentence() -> None:
+    assert Fruit("apple") is Fruit.APPLE
+    assert (f"{Fruit.APPLE}", Fruit.APPLE.description) == ("apple", "It keeps all winter.")
+
+
+def test_every_event_says_what_it_means() -> None:
+    for event in EventName:
+        assert event == event.name.lower()
+        assert event.description.endswith((".", ")."))
+        assert all(field.isidentifier() for field in event.fields)

@@ -9,7 +9,6 @@ import asyncio
 import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -19,7 +18,7 @@ from servobus.bus.records import ServoRecord
 from servobus.engine.coalescer import Ticket
 from servobus.engine.health import Condition, Node
 from servobus.engine.queue import Job
-from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError
+from servobus.errors import Busy, DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError, SettleTimeout
 from servobus.values import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
 
 if TYPE_CHECKING:
@@ -111,8 +110,9 @@ class Motion:
             return
         counts["goals_failed"] += 1
         if not future.done():
-            error = copy(result)  # one error may end the tickets of several servos
-            future.set_exception(error.at(bus=self._bus.name, servo=record.name) if isinstance(error, ServobusError) else error)
+            future.set_exception(
+                result.at(bus=self._bus.name, servo=record.name) if isinstance(result, ServobusError) else result
+            )
 
     async def enable(self, servo: str) -> None:
         self.refuse()
@@ -139,7 +139,7 @@ class Motion:
     async def disable(self, servo: str) -> None:
         record = self._bus.records[servo]
         if self._bus.scheduler.session is not None:
-            raise LeaseHeld(SESSION, bus=self._bus.name, servo=servo)
+            raise Busy(SESSION, bus=self._bus.name, servo=servo)
         self._bus.scheduler.drop_goals(self._disabled, {servo})
         self._disable(record)
         report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
@@ -162,7 +162,7 @@ class Motion:
         """Whoever moved these is gone: those that are enabled stop as their `on_lost_client` says (park: hold first), between two
         plans of the others."""
         gone = LeaseHeld("the client that moved it is gone: nothing was sent")
-        self._bus.scheduler.drop_goals(lambda servo: copy(gone).at(bus=self._bus.name, servo=servo), servos)
+        self._bus.scheduler.drop_goals(lambda servo: gone.at(bus=self._bus.name, servo=servo), servos)
         records = [self._bus.records[servo] for servo in servos if self._bus.records[servo].enabled]
         return await self._stop(lambda record: record.options.on_lost_client, records, estop=False)
 
@@ -204,8 +204,7 @@ class Motion:
         return {record.name: reports[record.name] for record in servos}
 
     async def settle(self, servo: str, *, tolerance: float | None, timeout: float, parking: bool = False) -> State:
-        """Until it stands at its setpoint. Raises DeviceError with where it stands, EStopped and NotEnabled when it will not get
-        there any more."""
+        """Until it stands at its setpoint. Raises SettleTimeout; EStopped and NotEnabled when it will not get there any more."""
         bus, record = self._bus, self._bus.records[servo]
         moving = record.enabled
         near = bus.tolerance(servo) if tolerance is None else tolerance
@@ -218,7 +217,7 @@ class Motion:
             if there and not state.moving and not bus.scheduler.profile.leads(servo):
                 return state
             if bus.clock() >= end:
-                raise DeviceError(
+                raise SettleTimeout(
                     f"it did not settle within {timeout:g} s: it stands at {state.position}, its goal is {record.setpoint}",
                     bus=bus.name,
                     servo=servo,
@@ -257,7 +256,7 @@ class Motion:
         if self.latched:
             raise EStopped("the e-stop is latched: `clear` releases it", bus=self._bus.name)
         if self._bus.scheduler.session is not None:
-            raise LeaseHeld(SESSION, bus=self._bus.name)
+            raise Busy(SESSION, bus=self._bus.name)
         if self.leaving:
             raise NotEnabled("the rig is being left: its servos stop as their on_exit says, nothing was sent", bus=self._bus.name)
 

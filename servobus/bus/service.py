@@ -21,7 +21,7 @@ from servobus.engine.line import EchoFilter, Line
 from servobus.engine.queue import TRIES, Job
 from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats
-from servobus.errors import DeviceError, LeaseHeld, NotSupported, ServobusError
+from servobus.errors import Busy, DeviceError, NotSupported, ServobusError
 from servobus.protocols.base import Codec, Commissioning, Driver, LineTraits, Plan, Request
 from servobus.protocols.options import BusOptions
 from servobus.timers import clock_of
@@ -210,11 +210,11 @@ class BusService:
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[object]:
-        """Polls, probes and goals rest, motion is refused, other requests wait. Raises LeaseHeld when one is open already."""
+        """Polls, probes and goals rest, motion is refused, other requests wait. Raises Busy when one is open already."""
         self.motion.refuse()
         moving = [name for name, record in self.records.items() if record.enabled or name in self.motion.enabling]
         if moving:
-            raise LeaseHeld(f"{', '.join(moving)} {'is' if len(moving) == 1 else 'are'} enabled: disable first", bus=self.name)
+            raise Busy(f"{', '.join(moving)} {'is' if len(moving) == 1 else 'are'} enabled: disable first", bus=self.name)
         self.scheduler.session = session = object()
         try:
             yield session

@@ -10,6 +10,7 @@ import structlog
 from servobus.daemon.leases import Leases
 from servobus.rig.events import Event
 from servobus.rig.local import LocalRig
+from servobus.values import EventName
 
 log = structlog.get_logger("servobus")
 STOPPING = "the client that moved it is gone, and it is being stopped: wait a moment"
@@ -88,7 +89,7 @@ class LeaseWatch:
         self.leases.block(known, STOPPING)
         log.warning("lease_lost", client=label, servos=sorted(servos), reason=reason)
         fields = {"client": label, "servos": sorted(servos), "reason": reason}
-        self._rig.announcer.tell(Event("lease_lost", self._loop.time(), fields))
+        self._rig.announcer.tell(Event(EventName.LEASE_LOST, self._loop.time(), fields))
         task = asyncio.create_task(self._stop(known))
         self._stopping.add(task)
         task.add_done_callback(self._stopping.discard)

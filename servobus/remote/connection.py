@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import msgspec
 
-from servobus.errors import LimitError, LinkDown, Overloaded, ReplyTimeout
+from servobus.errors import InvalidRequest, LimitError, LinkDown, Overloaded, ReplyTimeout
 from servobus.rpc.errors import decoded
 from servobus.rpc.methods import MAX_LINE, METHODS
 
@@ -183,7 +183,7 @@ class Connection(asyncio.Protocol):
         except OverflowError as error:
             raise LimitError(f"a number is too large: {error}; nothing was sent") from None
         if len(line) > MAX_LINE:
-            raise LimitError(f"this call is {len(line)} bytes long, the daemon takes {MAX_LINE}: split it; nothing was sent")
+            raise InvalidRequest(f"this call is {len(line)} bytes long, the daemon takes {MAX_LINE}: split it; nothing was sent")
         return line
 
     # Ends

@@ -21,6 +21,7 @@ from servobus.remote.session import DEADLINE, Dial, Session
 from servobus.rig.events import Announcer, Event, Feed
 from servobus.rig.interface import Found, Rig, Snapshot
 from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
+from servobus.values import EventName
 
 SHORTEST_LEASE = 0.1
 """Seconds; no daemon makes us renew more often than that asks for."""
@@ -71,9 +72,9 @@ class Listening(Rig):
         if lost is not None:
             for newest in self._watching:
                 newest.put(self._cache.snapshot(self._clock()))
-            self._announcer.tell(Event("daemon_lost", self._clock(), {"reason": lost.message}))
+            self._announcer.tell(Event(EventName.DAEMON_LOST, self._clock(), {"reason": lost.message}))
         elif was is not None:
-            self._announcer.tell(Event("daemon_back", self._clock()))
+            self._announcer.tell(Event(EventName.DAEMON_BACK, self._clock()))
 
     async def leave(self, *, lost: bool) -> None:
         """Give back what is held, unless `lost`; then hang up."""

@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from servobus.errors import LimitError, ServobusError
+from servobus.errors import InvalidRequest, LimitError, ServobusError
 from servobus.remote.address import address_of, token_of
 from servobus.remote.listener import Listening
 from servobus.remote.session import DEADLINE
@@ -63,7 +63,7 @@ class RemoteRig(Listening):
         full: dict[str, Goal] = {}
         for name, goal in goals.items():
             if (whole := self.full_name(name)) in full:
-                raise LimitError(f"{whole} is named twice: give it one goal; nothing was sent")
+                raise InvalidRequest(f"{whole} is named twice: give it one goal; nothing was sent")
             full[whole] = self._checked(whole, goal)
         if not full:
             return {}

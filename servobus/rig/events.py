@@ -17,6 +17,7 @@ class Event:
     """`name` says what (`servo_offline`, `estop`, `line_down`, `lease_lost` ...), `fields` where and why."""
 
     name: str
+    """An `EventName`; from a daemon of another version it may be one that is not known here."""
     time: float
     """Monotonic seconds."""
     fields: Mapping[str, Any] = field(default_factory=dict)

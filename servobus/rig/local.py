@@ -14,16 +14,16 @@ from anyio.abc import TaskGroup
 from servobus.bus.scan import scan
 from servobus.bus.service import BusService
 from servobus.config.loader import Config, load_config
-from servobus.errors import EStopped, LeaseHeld, LimitError, NotSupported, UnknownName
+from servobus.errors import Busy, InvalidRequest, NotSupported, UnknownName
 from servobus.protocols.registry import PROTOCOLS
 from servobus.rig.events import Announcer, Event
 from servobus.rig.interface import Found, Reload, Rig, Snapshot
 from servobus.rig.results import outcomes, raise_failures
 from servobus.rig.supervisor import BusSupervisor, Trace
-from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
+from servobus.values import Change, EventName, Goal, Identity, Outcome, State, StopReport
 
 R = TypeVar("R")
-QUIET = frozenset({"line_up", "echo_probed", "estop_cleared", "servo_online", "reloaded"})
+QUIET = {EventName.LINE_UP, EventName.ECHO_PROBED, EventName.ESTOP_CLEARED, EventName.SERVO_ONLINE, EventName.RELOADED}
 """Events that are no reason to look."""
 
 log = structlog.get_logger("servobus")
@@ -95,7 +95,7 @@ class LocalRig(Rig):
             raise NotSupported("this rig was not opened from a file, so there is none to read again")
         config = load_config(self.path)  # an invalid file ends here, and nothing has changed
         if self._reloading is not None and not self._reloading.done():
-            raise LeaseHeld("the config is being read anew already: wait until that is done")
+            raise Busy("the config is being read anew already: wait until that is done")
         self._reloading = asyncio.create_task(self._reload(config))
         return await asyncio.shield(self._reloading)  # a caller that leaves does not stop it half-way
 
@@ -116,7 +116,7 @@ class LocalRig(Rig):
             self._group.start_soon(self.supervisors[name].run, True)
         added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
         report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
-        self._event("reloaded", **asdict(report))
+        self._event(EventName.RELOADED, **asdict(report))
         return report
 
     @staticmethod
@@ -146,7 +146,7 @@ class LocalRig(Rig):
         for name, goal in goals.items():
             bus, servo = self.bus_of(name)
             if servo in parts.setdefault(bus, {}):
-                raise LimitError(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
+                raise InvalidRequest(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
             parts[bus][servo] = goal
         checked = {bus: bus.motion.check(part) for bus, part in parts.items()}
         futures = {
@@ -167,7 +167,7 @@ class LocalRig(Rig):
         return await asyncio.shield(stopping)  # a caller that leaves does not end it
 
     async def _stop_all(self) -> dict[str, StopReport]:
-        self._event("estop")
+        self._event(EventName.ESTOP)
         parking = [
             (supervisor, record) for supervisor in self.supervisors.values() for record in supervisor.enabled("on_estop", "park")
         ]
@@ -186,10 +186,10 @@ class LocalRig(Rig):
 
     async def clear(self) -> None:
         if self._stopping:
-            raise EStopped("servos are still being stopped or parked: clear when they stand")
+            raise Busy("servos are still being stopped or parked: clear when they stand")
         for bus in self.buses.values():
             bus.motion.latched = False
-        self._event("estop_cleared")
+        self._event(EventName.ESTOP_CLEARED)
 
     @property
     def stopped(self) -> bool:

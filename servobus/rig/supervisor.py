@@ -21,7 +21,7 @@ from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 from servobus.protocols.registry import PROTOCOLS
 from servobus.simulation.link import SIMULATED, SimulatedLink, simulated_link
-from servobus.values import StopReport
+from servobus.values import EventName, StopReport
 
 Trace = Callable[[str, bool, bytes, float], None]
 """(bus, sent, bytes, monotonic seconds) of everything on the wire."""
@@ -74,18 +74,18 @@ class BusSupervisor:
         except LinkDown as error:
             tried = self.tried.is_set()  # the first time it may be raised, and need not be told twice
             if (tried or degraded) and str(error) != str(self.down):
-                self._event("waiting_for_port", bus=self.name, port=self.link.address, reason=error.message)
+                self._event(EventName.WAITING_FOR_PORT, bus=self.name, port=self.link.address, reason=error.message)
             self.down = error
             self.tried.set()
             await anyio.sleep(RETRY)
             return
         self.down = None
         self.bus.line.traits = self.link.traits  # what is known of it only now: a tunnel's limits
-        self._event("line_up", bus=self.name, port=self.link.address)
+        self._event(EventName.LINE_UP, bus=self.name, port=self.link.address)
         await self.bus.start()
         self.tried.set()
         await self.bus.master.wait_closed()
-        self._event("line_down", bus=self.name, port=self.link.address)
+        self._event(EventName.LINE_DOWN, bus=self.name, port=self.link.address)
 
     def enabled(self, policy: str, kind: str) -> list[ServoRecord]:
         """The enabled servos whose `policy` (on_estop, on_exit, on_lost_client) is this kind."""
@@ -95,7 +95,7 @@ class BusSupervisor:
         """To the park pose, then limp; limp also when it does not get there in time."""
         report = await self.bus.motion.park(record.name)
         if not report.confirmed:
-            self._event("park_unconfirmed", bus=self.name, servo=record.name, detail=report.detail)
+            self._event(EventName.PARK_UNCONFIRMED, bus=self.name, servo=record.name, detail=report.detail)
         return report
 
     async def leave(self) -> dict[str, StopReport]:
@@ -112,7 +112,7 @@ class BusSupervisor:
             left.update(await motion.leave())
         for servo, report in left.items():
             if not report.confirmed and report.action != "park":  # that has its own event
-                self._event("exit_unconfirmed", bus=self.name, servo=servo, action=report.action, detail=report.detail)
+                self._event(EventName.EXIT_UNCONFIRMED, bus=self.name, servo=servo, action=report.action, detail=report.detail)
         return {f"{self.name}/{servo}": report for servo, report in left.items()}
 
     async def close(self) -> None:

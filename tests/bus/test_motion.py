@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from servobus.errors import DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ReplyTimeout
+from servobus.errors import Busy, DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
 from servobus.values import Goal, Outcome
 from tests.engine.scripted_line import Answers, puppet_bus
@@ -94,7 +94,7 @@ async def test_disable_that_does_not_read_back_is_an_error_and_it_is_disabled_fo
 async def test_disable_is_refused_in_an_exclusive_session() -> None:
     async with puppet_bus() as (bus, puppet, _, _), bus.exclusive():
         puppet.heard.clear()
-        with pytest.raises(LeaseHeld, match="arm/s1"):
+        with pytest.raises(Busy, match="arm/s1"):
             await bus.motion.disable("s1")
         assert puppet.heard == []
 

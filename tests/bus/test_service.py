@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from servobus.errors import EStopped, LeaseHeld, LinkDown, NotSupported, ReplyTimeout
+from servobus.errors import Busy, EStopped, LinkDown, NotSupported, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
 from tests.engine.scripted_line import puppet_bus
 from tests.virtual_time import virtual
@@ -73,14 +73,14 @@ async def test_an_exclusive_session_has_the_line_alone() -> None:
         async with bus.exclusive() as session:
             puppet.heard.clear()
             waiting = asyncio.create_task(bus.read_register("s1", "present_position", raw=True))
-            with pytest.raises(LeaseHeld, match="session"):
+            with pytest.raises(Busy, match="session"):
                 await bus.motion.enable("s1")
             await asyncio.sleep(0.2)
             assert puppet.heard == []
             assert await bus.ask(bus.driver.ping(2), session=session) == 0
             assert len(puppet.heard) == 1
             assert not waiting.done()
-            with pytest.raises(LeaseHeld):
+            with pytest.raises(Busy):
                 async with bus.exclusive():
                     raise AssertionError
         assert await waiting == 0
@@ -92,11 +92,11 @@ async def test_an_exclusive_session_has_the_line_alone() -> None:
 async def test_no_session_while_the_e_stop_holds_or_something_is_enabled() -> None:
     async with puppet_bus() as (bus, _, _, _):
         bus.records["s1"].enabled = True
-        with pytest.raises(LeaseHeld, match="s1 is enabled"):
+        with pytest.raises(Busy, match="s1 is enabled"):
             async with bus.exclusive():
                 raise AssertionError
         bus.records["s2"].enabled = True
-        with pytest.raises(LeaseHeld, match="s1, s2 are enabled"):
+        with pytest.raises(Busy, match="s1, s2 are enabled"):
             async with bus.exclusive():
                 raise AssertionError
         await bus.motion.stop()

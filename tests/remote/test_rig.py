@@ -10,7 +10,17 @@ from typing import Any
 
 import pytest
 
-from servobus.errors import AccessDenied, ConfigError, LimitError, LinkDown, NotSupported, Overloaded, ReplyTimeout, UnknownName
+from servobus.errors import (
+    AccessDenied,
+    ConfigError,
+    InvalidRequest,
+    LimitError,
+    LinkDown,
+    NotSupported,
+    Overloaded,
+    ReplyTimeout,
+    UnknownName,
+)
 from servobus.remote.connection import MAX_ANSWER, MAX_WAITING
 from servobus.remote.rig import connect
 from servobus.remote.session import SILENCE
@@ -213,7 +223,7 @@ async def test_a_scan_goes_on_as_long_as_it_reports(tmp_path: Path) -> None:
 @virtual
 async def test_a_call_that_is_too_much(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
-        with pytest.raises(LimitError, match="split it"):
+        with pytest.raises(InvalidRequest, match="split it"):
             await rig.read_register("s1", "x" * MAX_LINE)
         daemon.answers["ping"] = lambda *_: None
         waiting = [asyncio.create_task(rig.ping("s1")) for _ in range(MAX_WAITING)]
@@ -245,7 +255,7 @@ async def test_what_is_no_number_never_leaves(tmp_path: Path, value: Any) -> Non
             await rig["s1"].write_register("torque_limit", value)
         with pytest.raises(UnknownName):
             await rig["s3"].move_to(1)
-        with pytest.raises(LimitError, match="twice"):
+        with pytest.raises(InvalidRequest, match="twice"):
             await rig.move({"s1": 1, "arm/s1": 1})
         assert await rig.move({}) == {}
         assert len(daemon.heard) == before

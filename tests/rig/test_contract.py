@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 
 from servobus.config.loader import Config
-from servobus.errors import DeviceError, LeaseHeld, LimitError, NotSupported, ReplyTimeout, UnknownName
+from servobus.errors import Busy, DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.kst.codec import Command
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.rig.interface import Found
@@ -190,7 +190,7 @@ async def test_scanning(over: Over, tmp_path: Path) -> None:
             await rig.scan("arm", ids=[1, 2], progress=fail)
         await asyncio.sleep(1)
         await rig.enable("s1")
-        with pytest.raises(LeaseHeld, match="s1"):
+        with pytest.raises(Busy, match="s1"):
             await rig.scan("arm", ids=[1])
 
 

@@ -7,15 +7,15 @@ import asyncio
 import pytest
 
 from servobus.errors import (
-    DeviceError,
+    Busy,
     EStopped,
-    LeaseHeld,
     LimitError,
     LinkDown,
     NotEnabled,
     NotSupported,
     PartialFailure,
     PortMissing,
+    SettleTimeout,
     UnknownName,
 )
 from servobus.protocols.sms.codec import Instruction
@@ -72,7 +72,7 @@ async def test_stop_parks_and_then_goes_limp() -> None:
         await rig["s1"].move_to(40)
         await rig["s1"].settle()
         assert (await rig.stop())["arm/s1"].action == "hold"
-        with pytest.raises(EStopped, match="park"):
+        with pytest.raises(Busy, match="park"):
             await rig.clear()
         await asyncio.sleep(6)
         device = devices(rig)[1]
@@ -199,7 +199,7 @@ async def test_settle_says_where_it_stands() -> None:
         await rig.enable()
         devices(rig)[1].joint.stuck = True
         await rig["s1"].move_to(30)
-        with pytest.raises(DeviceError, match="0"):
+        with pytest.raises(SettleTimeout, match="0"):
             await rig["s1"].settle(timeout=0.5)
 
 
@@ -211,7 +211,7 @@ async def test_scan_finds_and_refuses_while_something_is_enabled() -> None:
         assert [(hit.id, hit.model) for hit in found] == [(1, "sts"), (2, "sts"), (3, "sts")]
         assert progress[-1] == 4
         await rig.enable("s1")
-        with pytest.raises(LeaseHeld, match="s1"):
+        with pytest.raises(Busy, match="s1"):
             await rig.scan("arm", ids=[1])
         with pytest.raises(UnknownName):
             await rig.scan("leg")

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from servobus.errors import EStopped, LeaseHeld, LimitError, NotEnabled, ServobusError
+from servobus.errors import Busy, EStopped, InvalidRequest, NotEnabled, ServobusError
 from servobus.rig.local import LocalRig
 from servobus.rig.opening import open_rig
 from tests.simulated_rigs import config, devices
@@ -55,7 +55,7 @@ async def test_a_stop_whose_caller_leaves_is_done_all_the_same() -> None:
         stopping.cancel()
         with pytest.raises(asyncio.CancelledError):
             await stopping
-        with pytest.raises(EStopped, match="still being stopped"):
+        with pytest.raises(Busy, match="still being stopped"):
             await rig.clear()
         await asyncio.sleep(1)
         assert torque(rig) == 0
@@ -109,7 +109,7 @@ async def test_no_session_while_something_is_being_enabled() -> None:
     async with open_rig(config("s1: {id: 1, model: sts}")) as rig:
         enabling = asyncio.create_task(rig.enable())
         await asyncio.sleep(0.001)
-        with pytest.raises(LeaseHeld, match="s1"):
+        with pytest.raises(Busy, match="s1"):
             await rig.scan("arm", ids=[1])
         await enabling
 
@@ -164,7 +164,7 @@ async def test_a_cancelled_exit_is_done_all_the_same() -> None:
 async def test_one_servo_under_two_names() -> None:
     async with open_rig(config(LIMP)) as rig:
         await rig.enable()
-        with pytest.raises(LimitError, match="named twice"):
+        with pytest.raises(InvalidRequest, match="named twice"):
             await rig.move({"s1": 10, "arm/s1": 20})
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from servobus.errors import ConfigError, EStopped, LeaseHeld, LinkDown, NotSupported, UnknownName
+from servobus.errors import Busy, ConfigError, EStopped, LinkDown, NotSupported, UnknownName
 from servobus.rig.interface import Reload
 from servobus.rig.opening import open_rig
 from tests.simulated_rigs import config, devices
@@ -112,7 +112,7 @@ async def test_one_at_a_time_and_to_its_end(path: Path) -> None:
         write(path, TWO.replace("id: 1,", "id: 7,"))
         first = asyncio.create_task(rig.reload())
         await asyncio.sleep(0)
-        with pytest.raises(LeaseHeld, match="already"):
+        with pytest.raises(Busy, match="already"):
             await rig.reload()
         first.cancel()  # whoever asked may leave
         with pytest.raises(asyncio.CancelledError):

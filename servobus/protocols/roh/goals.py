@@ -7,7 +7,6 @@ was refused is not sent off with the wrong one.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
@@ -115,7 +114,7 @@ def _forget(run: Iterable[Word]) -> None:
 
 def _own(error: ServobusError, name: str) -> ServobusError:
     """One error may end several goals, each with its own name."""
-    return copy(error).at(servo=name)
+    return error.at(servo=name)
 
 
 def by_hand(hands: Mapping[int, Hand], goals: Sequence[tuple[Finger, ServoGoal]]) -> list[HandGoals]:
