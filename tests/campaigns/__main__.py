@@ -1,4 +1,4 @@
-"""What `scripts/soak` and `scripts/bench` run: long campaigns that print their figures."""
+"""What `scripts/soak` runs: long campaigns that print their figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.campaigns import crowd, daemon, dead_servo, faults, kst_bench, slow_hand, turns_bench
+from tests.campaigns import crowd, daemon, dead_servo, faults, slow_hand
 from tests.campaigns.oracle import ORACLES
 
 
@@ -49,16 +49,6 @@ def soak_line(_: int) -> bool:
     )
 
 
-def bench_turns(_: int) -> bool:
-    ratios = turns_bench.main()
-    best = ratios["servobus, 12 callers, uvloop"]
-    return best >= 0.45 and best > ratios["feetech-servo-sdk"]
-
-
-def bench_kst(_: int) -> bool:
-    return min(kst_bench.main().values()) >= 0.9
-
-
 def soak_kill(_: int) -> bool:
     result = daemon.kills(200)
     result.report()
@@ -71,36 +61,26 @@ def soak_daemon(_: int) -> bool:
     return result.kept()
 
 
-def bench_door(_: int) -> bool:
-    ratio, each = daemon.door()
-    return ratio <= 2.0 and each <= 40.0
-
-
-CAMPAIGNS: dict[str, dict[str, Callable[[int], bool]]] = {
-    "soak": {
-        "faults": soak_faults,
-        "cancel": soak_cancel,
-        "hand": soak_hand,
-        "line": soak_line,
-        "kill": soak_kill,
-        "daemon": soak_daemon,
-    },
-    "bench": {"turns": bench_turns, "kst": bench_kst, "door": bench_door},
+CAMPAIGNS: dict[str, Callable[[int], bool]] = {
+    "faults": soak_faults,
+    "cancel": soak_cancel,
+    "hand": soak_hand,
+    "line": soak_line,
+    "kill": soak_kill,
+    "daemon": soak_daemon,
 }
 
 
 def main() -> int:
     """Status 1 when a figure misses what it has to reach."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=CAMPAIGNS)
-    parser.add_argument("campaigns", nargs="*", help="which; all if none is named")
+    parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__)
+    parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=f"{', '.join(CAMPAIGNS)}; all if none is named")
     parser.add_argument("--count", type=int, default=1_000_000, help="reads of the faults campaign, ten times the cancels")
     arguments = parser.parse_args()
-    known = CAMPAIGNS[arguments.kind]
-    if unknown := set(arguments.campaigns) - set(known):
-        parser.error(f"no {arguments.kind} campaign {', '.join(sorted(unknown))}: there are {', '.join(known)}")
+    if unknown := set(arguments.campaigns) - set(CAMPAIGNS):
+        parser.error(f"no campaign {', '.join(sorted(unknown))}: there are {', '.join(CAMPAIGNS)}")
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-    kept = [known[name](arguments.count) for name in arguments.campaigns or known]
+    kept = [CAMPAIGNS[name](arguments.count) for name in arguments.campaigns or CAMPAIGNS]
     return 0 if all(kept) else 1
 
 

@@ -1,13 +1,9 @@
-"""The daemon as a process: killed and started again and again; and how long its door takes beside a bare echo.
-
-The echo is taken in the same run and the same regime: one core is kept busy, and everything measured shares the other.
-"""
+"""The daemon as a process that is killed and started again and again."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -19,10 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import monotonic, perf_counter, sleep
-
-from servobus.cli.output import loop_factory
-from tests.campaigns.turns_bench import spin
+from time import monotonic
 
 RIG = """version: 1
 door: {rate: null, clients: 5000, clients_per_user: 5000}
@@ -141,112 +134,3 @@ async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
         pty.close()
         line.close()
     return result
-
-
-# The door beside an echo
-
-
-ECHO = """
-import asyncio, sys, msgspec
-decode, encode = msgspec.json.decode, msgspec.json.encode
-class Echo(asyncio.Protocol):
-    def connection_made(self, transport): self.transport = transport
-    def data_received(self, data):
-        for line in data.splitlines(): self.transport.write(encode(decode(line)) + b"\\n")
-async def main():
-    server = await asyncio.get_running_loop().create_unix_server(Echo, sys.argv[1])
-    await server.serve_forever()
-try:
-    import uvloop; uvloop.run(main())
-except ImportError:
-    asyncio.run(main())
-"""
-ROUNDS, TRIPS = 5, 4000
-
-
-class Asker(asyncio.Protocol):
-    """One question in flight."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-        self.done = asyncio.get_running_loop().create_future()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport) or hasattr(transport, "write")
-        self.transport = transport
-        self._ask()
-
-    def _ask(self) -> None:
-        self._asked = perf_counter()
-        self.transport.write(READ)
-
-    def data_received(self, data: bytes) -> None:
-        if not data.endswith(b"\n"):
-            return
-        self.times.append(perf_counter() - self._asked)
-        if len(self.times) < TRIPS:
-            self._ask()
-        elif not self.done.done():
-            self.transport.close()
-            self.done.set_result(None)
-
-
-def echoing(path: str) -> subprocess.Popen[bytes]:
-    """A process that echoes there; returns when it does."""
-    process = subprocess.Popen([sys.executable, "-c", ECHO, path])
-    while not Path(path).exists():
-        sleep(0.01)
-    return process
-
-
-def cpu(pid: int) -> float:
-    """Seconds of CPU that a process has used."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-async def _trips(path: str) -> float:
-    """Microseconds, p50."""
-    _, asker = await asyncio.get_running_loop().create_unix_connection(Asker, path)
-    await asker.done
-    return statistics.median(asker.times) * 1e6
-
-
-async def _door(folder: Path) -> tuple[float, float]:
-    echo_path, door_path = str(folder / "echo.sock"), str(folder / "s" / "servobus.sock")
-    with daemon(folder, "sim:") as process:
-        echo = echoing(echo_path)
-        try:
-            assert await answer(folder, 10)
-            echoes, doors, used, idle = [], [], 0.0, 0.0
-            for _ in range(ROUNDS):
-                echoes.append(await _trips(echo_path))
-                before, at = cpu(process.pid), monotonic()
-                doors.append(await _trips(door_path))
-                used += cpu(process.pid) - before
-                took = monotonic() - at
-                before = cpu(process.pid)
-                await asyncio.sleep(took)  # what the bus itself needs meanwhile
-                idle += cpu(process.pid) - before
-        finally:
-            echo.kill()
-            echo.wait()
-    ratio = statistics.median(doors) / statistics.median(echoes)
-    each = max(0.0, used - idle) / (ROUNDS * TRIPS) * 1e6
-    print(f"cached read through the door: p50 {statistics.median(doors):.0f} us, {ratio:.2f} of a bare echo of JSON lines")
-    print(f"CPU of the daemon: {each:.0f} us a request")
-    return ratio, each
-
-
-def door() -> tuple[float, float]:
-    cores = os.sched_getaffinity(0)
-    spinner = multiprocessing.get_context("fork").Process(target=spin, daemon=True)
-    spinner.start()
-    try:
-        os.sched_setaffinity(0, {min(cores)})  # the processes begun from here inherit it
-        with tempfile.TemporaryDirectory() as folder, asyncio.Runner(loop_factory=loop_factory()) as runner:
-            return runner.run(_door(Path(folder)))
-    finally:
-        os.sched_setaffinity(0, cores)
-        spinner.kill()
-        spinner.join()

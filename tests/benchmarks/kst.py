@@ -1,8 +1,8 @@
-"""A poll of twelve KST servos on a paced line at 512000 baud, half and full duplex, beside a bare loop of the same duplex.
+"""Reads of twelve KST servos on a paced line at 512000 baud, half and full duplex, beside a bare loop of the same duplex.
 
-The responder holds each frame for its wire time on each of two pairs of wires, and spins for it, so it keeps one core busy; the
-client has the other. The bare loop checks nothing: it writes the next question when an answer is here (half), or keeps three
-questions under way (full), which is what the line can carry.
+The responder holds each frame for its wire time on each of two pairs of wires. It spins while it waits, so it keeps one core
+busy; the client has the other. The bare loop checks nothing. It writes the next request when a reply has arrived (half duplex),
+or keeps three requests under way (full duplex), which is what the line can carry.
 """
 
 from __future__ import annotations
@@ -24,37 +24,38 @@ from servobus.config.loader import parse_config
 from servobus.protocols.kst.codec import Command, encode
 from servobus.rig.interface import Servo
 from servobus.rig.opening import open_rig
+from tests.benchmarks.report import Report, Row, Target
 
 BAUDRATE = 512_000
 SIZE = 14
-FRAME = SIZE * 10 / BAUDRATE
+FRAME_S = SIZE * 10 / BAUDRATE
 SERVOS = 12
-PAUSE = 0.000_05
-"""Seconds between question and answer, the same for all."""
+REPLY_DELAY_S = 0.000_05
+"""Between a request and its reply, the same for all servos."""
 UNDER_WAY = {"half": 1, "full": 3}
 
 
 def respond(descriptor: int) -> None:
-    """Servos 1 to 12, on a wire for questions and a wire for answers."""
+    """Servos 1 to 12, with one pair of wires for requests and one for replies."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     os.set_blocking(descriptor, False)
-    asked_until = answered_until = 0.0
-    answers: deque[tuple[float, bytes]] = deque()
-    heard = b""
+    request_end = reply_end = 0.0
+    replies: deque[tuple[float, bytes]] = deque()
+    received = b""
     while True:
         now = time.perf_counter()
-        while answers and answers[0][0] <= now:
-            os.write(descriptor, answers.popleft()[1])
+        while replies and replies[0][0] <= now:
+            os.write(descriptor, replies.popleft()[1])
         try:
-            heard += os.read(descriptor, 4096)
+            received += os.read(descriptor, 4096)
         except BlockingIOError:
             continue
-        while len(heard) >= SIZE:
-            frame, heard = heard[:SIZE], heard[SIZE:]
-            asked_until = max(now, asked_until) + FRAME
-            answered_until = max(asked_until + PAUSE, answered_until) + FRAME
+        while len(received) >= SIZE:
+            frame, received = received[:SIZE], received[SIZE:]
+            request_end = max(now, request_end) + FRAME_S
+            reply_end = max(request_end + REPLY_DELAY_S, reply_end) + FRAME_S
             data = bytes((frame[2],)) if frame[3] == Command.READ_ID else bytes(2)
-            answers.append((answered_until, encode(frame[2], frame[3] + 0x40, data)))
+            replies.append((reply_end, encode(frame[2], frame[3] + 0x40, data)))
 
 
 @contextmanager
@@ -102,7 +103,7 @@ def bare(port: str, duplex: str, seconds: float) -> float:
     return turns / seconds
 
 
-def servobus(port: str, duplex: str, seconds: float) -> float:
+def servobus_read(port: str, duplex: str, seconds: float) -> float:
     """The same reads by one caller for each servo, through the public Rig on uvloop."""
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(_read(port, duplex, seconds))
@@ -111,8 +112,8 @@ def servobus(port: str, duplex: str, seconds: float) -> float:
 async def _read(port: str, duplex: str, seconds: float) -> float:
     servos = "".join(f"      k{number}: {{id: {number}}}\n" for number in range(1, SERVOS + 1))
     head = f"version: 1\nbuses:\n  line:\n    protocol: kst\n    port: {port}\n    baudrate: {BAUDRATE}\n"
-    pause = 1000 * PAUSE
-    text = f"{head}    duplex: {duplex}\n    reply_delay_ms: [{pause}, {pause}]\n    servos:\n{servos}"
+    delay_ms = 1000 * REPLY_DELAY_S
+    text = f"{head}    duplex: {duplex}\n    reply_delay_ms: [{delay_ms}, {delay_ms}]\n    servos:\n{servos}"
     async with open_rig(parse_config(text, "bench", Path())) as rig:
         end = time.perf_counter() + seconds
         counts = await asyncio.gather(*(_caller(servo, end) for servo in rig))
@@ -127,22 +128,21 @@ async def _caller(servo: Servo, end: float) -> int:
     return turns
 
 
-CLIENTS: dict[str, Callable[[str, str, float], float]] = {"bare descriptor loop": bare, "servobus, 12 callers": servobus}
+CLIENTS: dict[str, Callable[[str, str, float], float]] = {"bare descriptor loop": bare, "servobus, 12 callers": servobus_read}
 
 
-def main(seconds: float = 1.0, rounds: int = 5) -> dict[str, float]:
-    """Print the medians; returns servobus's ratio to the bare loop for each duplex."""
+def main(seconds: float, rounds: int) -> Report:
+    """Medians; what servobus has to reach is nine tenths of the bare loop of the same duplex."""
     rates: dict[tuple[str, str], list[float]] = {}
     with line() as port:
         for _ in range(rounds):
             for duplex in UNDER_WAY:
                 for name, client in CLIENTS.items():
                     rates.setdefault((duplex, name), []).append(client(port, duplex, seconds))
-    ratios = {}
-    print(f"{'12 KST servos at 512000 baud':34} {'reads/s':>9} {'of the wire':>12} {'ratio to the bare loop':>24}")
-    for (duplex, name), found in rates.items():
-        median, floor = statistics.median(found), statistics.median(rates[duplex, "bare descriptor loop"])
-        ideal = 1 / (FRAME if duplex == "full" else 2 * FRAME + PAUSE)
-        print(f"{duplex + ' duplex, ' + name:34} {median:9.0f} {median / ideal:12.2f} {median / floor:24.2f}")
-        ratios[duplex] = median / floor
-    return ratios
+    rows: dict[str, Row] = {}
+    for (duplex, name), samples in rates.items():
+        median, floor = statistics.median(samples), statistics.median(rates[duplex, "bare descriptor loop"])
+        ideal = 1 / (FRAME_S if duplex == "full" else 2 * FRAME_S + REPLY_DELAY_S)
+        rows[f"{duplex} duplex, {name}"] = {"reads/s": median, "of the wire": median / ideal, "of the bare loop": median / floor}
+    targets = [Target(f"{duplex} duplex, servobus, 12 callers", "of the bare loop", minimum=0.9) for duplex in UNDER_WAY]
+    return Report(f"12 KST servos at {BAUDRATE} baud", rows, targets)
