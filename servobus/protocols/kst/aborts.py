@@ -1,7 +1,7 @@
-"""SDO abort codes (seed, section 9): their texts, the error each becomes here, and the order of their four bytes.
+"""Abort codes of error replies (KST RS422, 9): their texts, the error that each becomes, and the order of their four bytes.
 
-The seed prints a code as two words and does not say which byte comes first. No known code is another one read backwards, so with
-`auto` a code that is known in one order only tells which it is; big-endian, as printed, stands until then.
+The document prints a code as two 16-bit numbers and does not say which byte comes first. No known code is another one with its
+bytes reversed, so with `auto` a code that is known in only one order tells the order. Until then it is big-endian, as printed.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ ABORTS: dict[int, str] = {
     0x08000021: "Data cannot be transferred or stored to the application because of local control",
     0x08000022: "Data cannot be transferred or stored to the application because of the present device state",
     0x08000023: "Object dictionary dynamic generation fails or no object dictionary is present",
-    # Newer texts of CiA 301 have these two; the seed does not.
+    # Newer editions of CiA 301 have these two; the KST document does not.
     0x060A0023: "Resource not available",
     0x08000024: "No data available",
 }
 
 
 class DeviceTimeout(DeviceError):
-    """The servo itself gave up (0504 0000). A read may be asked again."""
+    """The servo reports an internal timeout (0504 0000). A read may be repeated."""
 
 
 class AccessRefused(DeviceError, NotSupported):
-    """The servo does not let this be read or written (0601)."""
+    """The servo does not allow this value to be read or written (0601)."""
 
 
 class UnknownObject(DeviceError):
@@ -62,19 +62,19 @@ class UnknownObject(DeviceError):
 
 
 class BadLength(DeviceError):
-    """The servo expected another length (0607)."""
+    """The servo expects another length (0607)."""
 
 
 class OutOfRange(DeviceError):
-    """The servo found the value outside its range (0609 0030 to 0032)."""
+    """The value is outside the servo's range (0609 0030 to 0032)."""
 
 
 class HardwareFault(DeviceError):
-    """The servo's hardware failed (0606). It latches: goals are refused until the servo is enabled again."""
+    """The servo's hardware has failed (0606). It latches: goals are refused until the servo is enabled again."""
 
 
 class WrongState(DeviceError):
-    """Not now: local control, or the servo's present state (0800 0021, 0800 0022)."""
+    """The servo refuses because of local control or its present state (0800 0021, 0800 0022)."""
 
 
 BY_CODE: dict[int, type[DeviceError]] = {
@@ -92,33 +92,33 @@ BY_GROUP: dict[int, type[DeviceError]] = {
     0x0606: HardwareFault,
     0x0607: BadLength,
 }
-"""The upper word of a code; what is in neither table is a plain DeviceError."""
+"""By the upper 16 bits of a code. A code that is in neither table becomes a plain DeviceError."""
 
 ADVICE: dict[type[DeviceError], str] = {
     DeviceError: "read its status and its firmware version",
-    DeviceTimeout: "ask again; if it goes on, look at its load and supply",
+    DeviceTimeout: "try again; if it happens again, check the servo's load and supply",
     AccessRefused: "this servo does not offer that command",
     UnknownObject: "its firmware does not know that: read its version",
-    BadLength: "its firmware may speak a newer protocol: read its version",
+    BadLength: "its firmware may use a newer protocol: read its version",
     OutOfRange: "compare the value with the servo's range (range_deg)",
-    HardwareFault: "look after the servo, then enable it again",
-    WrongState: "read its status, and ask again when that has changed",
+    HardwareFault: "check the servo, then enable it again",
+    WrongState: "read its status, and try again when that has changed",
 }
 
 
-def class_of(code: int) -> type[DeviceError]:
-    """What an abort code is raised as."""
+def error_class(code: int) -> type[DeviceError]:
+    """Return the error that an abort code is raised as."""
     return BY_CODE.get(code) or BY_GROUP.get(code >> 16) or DeviceError
 
 
-def words(code: int, data: bytes) -> str:
-    """`0609 0030 Value range ...`; the four bytes as heard where the code is not known."""
+def abort_text(code: int, data: bytes) -> str:
+    """Return `0609 0030 Value range ...`, or the four bytes where the code is unknown."""
     text = ABORTS.get(code)
     return f"{code >> 16:04X} {code & 0xFFFF:04X} {text}" if text else f"unknown abort code, bytes {data.hex(' ')}"
 
 
 def decode(data: bytes, order: Order | None) -> tuple[int, Order | None]:
-    """The code in four bytes, and the order in which it is a known one. `order`: what holds when neither is."""
+    """Return the code in four bytes, and the order in which it is a known code. `order` is used if it is known in neither."""
     big, little = int.from_bytes(data, "big"), int.from_bytes(data, "little")
     if big in ABORTS:
         return big, "be"
@@ -128,17 +128,17 @@ def decode(data: bytes, order: Order | None) -> tuple[int, Order | None]:
 
 
 class AbortReader:
-    """Turns the error replies of a bus into errors. Remembers the byte order, and which nodes have a hardware fault."""
+    """Turns the error replies of a bus into errors. Remembers the byte order, and which nodes reported a hardware fault."""
 
     def __init__(self, order: Literal["auto", "be", "le"] = "auto") -> None:
         self.learned: Order | None = None if order == "auto" else order
-        """None: no known code has been heard yet."""
+        """The byte order; None until a known code has arrived."""
         self.faulty: set[int] = set()
         """Nodes whose hardware fault is latched."""
         self._auto = order == "auto"
 
     def code(self, data: bytes) -> int:
-        """The code in the first four bytes of `data`."""
+        """Return the code in the first four bytes of `data`."""
         data = data[:CODE_SIZE]
         if not self._auto:
             return int.from_bytes(data, "little" if self.learned == "le" else "big")
@@ -146,10 +146,10 @@ class AbortReader:
         self.learned = order or self.learned
         return code
 
-    def error(self, node: int, asked: str, data: bytes, **where: Any) -> DeviceError:
-        """What to raise for an error reply of this node to `asked`."""
+    def error(self, node: int, command: str, data: bytes, **context: Any) -> DeviceError:
+        """Return the error for a node's error reply to a command. `context`: attributes of the error."""
         code = self.code(data)
-        kind = class_of(code)
+        kind = error_class(code)
         if kind is HardwareFault:
             self.faulty.add(node)
-        return kind(f"{asked} was refused: {words(code, data[:CODE_SIZE])}; {ADVICE[kind]}", code=code, **where)
+        return kind(f"{command} was refused: {abort_text(code, data[:CODE_SIZE])}; {ADVICE[kind]}", code=code, **context)

@@ -1,7 +1,10 @@
-"""Giving a servo its id and its baud rate (seed 3.1 to 3.3): one change at a time, on one servo, read back, saved on request.
+"""Gives a KST servo its id and baud rate (KST RS422, 3.1 to 3.3): one change at a time, on one servo, read back, saved on
+request.
 
-A change counts only after save and restart, so the servo is spoken to as before until then, and a second change is refused:
-`pending`. These plans belong in an exclusive session, which sees to it that nothing is enabled. Ids and rates are never retried.
+A change takes effect after save and restart. Until then the servo is addressed as before, the change is `pending`, and a second
+change of that servo is refused. After a restart, `restarted` finds out what became of the change: a saved id answers now, and
+what was not saved is lost. These plans run in an exclusive session, in which no servo is enabled. Ids and rates are never sent
+again.
 """
 
 from __future__ import annotations
@@ -11,46 +14,47 @@ from dataclasses import replace
 from typing import ClassVar
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols import base
-from servobus.protocols.base import Plan, ask
-from servobus.protocols.kst.codec import SAVE_WORD, Command
-from servobus.protocols.kst.identity import look
+from servobus.protocols.base import Commissioning, Plan, ask
+from servobus.protocols.kst.codec import SAVE_DATA, Command
+from servobus.protocols.kst.identity import observe
 from servobus.protocols.kst.options import KstBus
-from servobus.protocols.kst.requests import Broadcast, Confirmed, FrameTiming, Read, Save, Tell
+from servobus.protocols.kst.requests import Read, RequestSettings, Save, SetValue, UnansweredCommand
 from servobus.values import Change, known_command
 
 DOUBTFUL_ID = 0xFF
-"""The seed allows it as an address; what idle lines look like is a bad name for a servo."""
+"""The document allows it as an address, but an idle line reads as 0xFF."""
 
 
-class Commissioning(base.Commissioning):
-    """Remembers which nodes wait for a restart."""
+class KstCommissioning(Commissioning):
+    """Keeps the changes that wait for a restart."""
 
     commands: ClassVar = {"save": "writes its settings to flash"}
 
-    def __init__(self, options: KstBus, timing: FrameTiming) -> None:
+    def __init__(self, options: KstBus, settings: RequestSettings) -> None:
         self.options = options
-        self.timing = timing
+        self.settings = settings
         self.pending: dict[int, Change] = {}
+        """Node -> its change that is not in effect yet."""
 
     def set_id(self, node: int, new: int, *, save: bool = False) -> Plan[Change]:
-        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected, or `new` answers already."""
         first, last = self.options.id_range
         if not first <= new <= last:
             raise LimitError(f"id {new} is outside {first} to {last} (id_range): nothing was sent")
-        waiting = {change.value for other, change in self.pending.items() if change.what == "id" and other != node}
-        if new in ({servo.id for servo in self.options.servos.values()} | waiting) - {node}:
+        reserved = {change.value for other, change in self.pending.items() if change.what == "id" and other != node}
+        if new in ({servo.id for servo in self.options.servos.values()} | reserved) - {node}:
             raise LimitError(f"id {new} belongs to another servo of this bus: nothing was sent. Choose a free one")
         self._refuse_second(node)
         return self._change(Change(node, "id", new, notes=tuple(_id_notes(new))), Command.SET_ID, new, save)
 
     def set_baudrate(self, node: int, baudrate: int, *, save: bool = False) -> Plan[Change]:
-        """Raises LimitError, NotSupported at once; then DeviceError where two servos are suspected. No command reads the rate
-        back: what is confirmed is the echo, and that the servo still answers."""
+        """Return the plan that gives a node another baud rate.
+
+        No command reads the rate back. What is confirmed is that the servo repeats it, and that it still answers.
+        """
         codes = [code for code, rate in self.options.baud_table.items() if rate == baudrate]
         if not codes:
-            known = ", ".join(map(str, sorted(self.options.baud_table.values())))
-            raise LimitError(f"baud rate {baudrate} is none of {known}: nothing was sent")
+            rates = ", ".join(map(str, sorted(self.options.baud_table.values())))
+            raise LimitError(f"baud rate {baudrate} is not one of {rates}: nothing was sent")
         self._refuse_second(node)
         return self._change(Change(node, "baudrate", baudrate), Command.SET_BAUD, codes[0], save)
 
@@ -61,13 +65,13 @@ class Commissioning(base.Commissioning):
         return self.save(node)
 
     def save(self, node: int) -> Plan[tuple[str, ...]]:
-        """Write the servo's settings to its flash, once. Returns what a person should know of it."""
+        """Return the plan that writes the servo's settings to its flash, once. It returns notes for a person."""
         notes: tuple[str, ...] = ()
         if self.options.save_reply == "none":
-            yield from ask(Tell(self.timing, node, Command.SAVE, SAVE_WORD))
+            yield from ask(UnansweredCommand(self.settings, node, Command.SAVE, SAVE_DATA))
         else:
             try:
-                yield from ask(Save(self.timing, node))
+                yield from ask(Save(self.settings, node))
             except (ReplyTimeout, DeviceError) as error:
                 if self.options.save_reply == "required":
                     raise
@@ -77,54 +81,65 @@ class Commissioning(base.Commissioning):
             self.pending[node] = replace(self.pending[node], saved=not notes)
         return notes
 
-    def restarted(self, node: int) -> Plan[int]:
-        """After the servo was switched off and on (and the line set to its new rate): the id it answers to. A change that was not
-        saved is lost. Raises ReplyTimeout, DeviceError; the change is pending as before then."""
-        change = self.pending.get(node)
-        now = change.value if change is not None and change.what == "id" and change.saved else node
-        said = yield from ask(self._read_id(now))
-        if said != now:
-            raise DeviceError(f"id {now} answers, and says its id is {said}: was it restarted?")
-        self.pending.pop(node, None)
-        return now
+    def restarted(self, node: int) -> Plan[int | None] | None:
+        """Return the plan that finds out to which id a restarted servo answers; None where no change of it is pending.
 
-    def lone_id(self) -> Plan[int]:
-        """The id of the only servo on the line, asked of all. Raises NotSupported where the config does not allow that."""
-        return self._ask_all(Broadcast(self.timing, self.options, Command.READ_ID))
+        The plan asks the saved new id first, then the old one, and ends the pending change with the first that answers for
+        itself. It returns that id. It returns None, and the change stays pending, where neither does.
+        """
+        return self._restarted(self.pending[node]) if node in self.pending else None
+
+    def answered(self, node: int) -> None:
+        """A scan has found this id: the saved change to it is in effect."""
+        for old, change in list(self.pending.items()):
+            if change.what == "id" and change.saved and change.value == node:
+                del self.pending[old]
 
     def own_ids(self, node: int) -> tuple[int, ...]:
-        """What the servo at this address may say its id is: the seed does not tell whether a new one shows before the restart."""
+        """Return the ids that this servo may report: the document does not say whether a new one shows before the restart."""
         change = self.pending.get(node)
         return (node, change.value) if change is not None and change.what == "id" else (node,)
 
-    @staticmethod
-    def _ask_all(request: Broadcast) -> Plan[int]:
-        answer = yield from ask(request)
-        assert answer is not None  # the config waits for it, or does not allow the question
-        return answer.address
+    def _restarted(self, change: Change) -> Plan[int | None]:
+        candidates = (change.value, change.node) if change.what == "id" and change.saved else (change.node,)
+        for node in candidates:
+            try:
+                reported = yield from ask(self._read_id(node))
+            except (ReplyTimeout, DeviceError):
+                continue
+            if reported == node:
+                self.pending.pop(change.node, None)
+                return node
+        return None
 
     def _refuse_second(self, node: int) -> None:
         if node in self.pending:
             raise NotSupported(f"{self.pending[node]}. One change at a time: nothing was sent")
 
     def _change(self, change: Change, command: Command, value: int, save: bool) -> Plan[Change]:
+        """Check that it is one servo and the new id is free, set the value, read the id back, and save.
+
+        With `id_effective: immediate` the servo answers at its new id at once. After a new rate it cannot be read back then,
+        because the line has to change its rate first.
+        """
         immediate = self.options.id_effective == "immediate"
-        moves = change.what == "id" and immediate
+        address = value if immediate and change.what == "id" else change.node
         if change.what == "id" and change.value != change.node:
             yield from self._expect_silence(change.value)
-        suspicion = (yield from look(self.timing, change.node)).suspicion
+        suspicion = (yield from observe(self.settings, change.node)).suspicion
         if suspicion:
             raise DeviceError(f"{suspicion}. Nothing was changed")
-        yield from ask(Confirmed(self.timing, change.node, command, bytes((value,)), also=value if moves else None))
+        also = address if address != change.node else None
+        yield from ask(SetValue(self.settings, change.node, command, bytes((value,)), also=also))
         if immediate:
             change = replace(change, pending_reboot=False)
         else:
             self.pending[change.node] = change
-        if not (immediate and change.what == "baudrate"):  # there the line has to follow first
-            yield from self._read_back(change, value if moves else change.node)
+        if not (immediate and change.what == "baudrate"):
+            yield from self._read_back(change, address)
         if not save:
             return change
-        notes = yield from self.save(value if moves else change.node)
+        notes = yield from self.save(address)
         return replace(change, saved=not notes, notes=change.notes + notes)
 
     def _expect_silence(self, node: int) -> Plan[None]:
@@ -135,14 +150,14 @@ class Commissioning(base.Commissioning):
         raise DeviceError(f"id {node} answers already: choose a free one. Nothing was changed")
 
     def _read_back(self, change: Change, node: int) -> Plan[None]:
-        said = yield from ask(self._read_id(node))
-        if said not in (*self.own_ids(node), node):
-            raise DeviceError(f"after {change.what} {change.value} was set, the servo says its id is {said}: do not save it")
+        reported = yield from ask(self._read_id(node))
+        if reported not in (*self.own_ids(node), node):
+            raise DeviceError(f"after {change.what} {change.value} was set, the servo reports id {reported}: do not save it")
 
     def _read_id(self, node: int) -> Read[int]:
-        return Read(self.timing, node, Command.READ_ID, lambda data: data[0], once=True)
+        return Read(self.settings, node, Command.READ_ID, lambda data: data[0], once=True)
 
 
 def _id_notes(new: int) -> Iterator[str]:
     if new == DOUBTFUL_ID:
-        yield "id 255 is what a silent line looks like: choose another if you can"
+        yield "id 255 is what a silent line reads as: choose another if you can"

@@ -1,7 +1,7 @@
-"""The KST driver: what to say for each verb (seed, section 3). Sans-IO. Written from the specification, never seen on hardware.
+"""The KST driver: which requests each verb takes (KST RS422, 3). Sans-IO. Written from the document, not tried on hardware yet.
 
-The protocol has no ping, torque, stop or speed command. So: ping reads the id; enabled is the host's gate, and writes nothing; a
-stop sends the last setpoint once more; and the host must keep speeds itself (`pace`).
+The protocol has no ping, torque, stop or speed command. So a ping reads the id, `enable` writes nothing and only lets goals pass,
+a stop sends the last setpoint again, and the host keeps the speed (`host_speed`).
 """
 
 from __future__ import annotations
@@ -12,36 +12,37 @@ from functools import partial
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
+from servobus.protocols import fence
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
-from servobus.protocols.kst.commissioning import Commissioning
+from servobus.protocols.kst.commissioning import KstCommissioning
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
-from servobus.protocols.kst.requests import Fence, FrameTiming, Read
-from servobus.protocols.kst.servo import FittedServo
+from servobus.protocols.kst.requests import Fence, Read, RequestSettings
+from servobus.protocols.kst.servo import CalibratedServo
+from servobus.protocols.speed import goal_speed
 from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
 FENCES = (Command.READ_ID, Command.READ_VERSION, Command.READ_STATUS, Command.READ_POSITION)
-"""The reads there are; a fence is one whose reply is not under way. The first names the servo in its data too."""
-FENCE_TRIES = 2
-VERBS = {"goal_position": "use move", "id": "use commissioning (set_id)", "baud_rate": "use commissioning (set_baudrate)"}
-"""Registers that another verb writes."""
+"""The reads that can be a fence, the preferred one first: its reply also has the servo's id in the data."""
+OTHER_VERBS = {"goal_position": "use move", "id": "use commissioning (set_id)", "baud_rate": "use commissioning (set_baudrate)"}
+"""Register -> the verb that writes it."""
 
 
 class KstDriver(Driver):
-    """See `protocols.base.Driver`."""
+    """The driver of a KST bus; see `protocols.base.Driver`."""
 
-    commissioning: Commissioning
+    commissioning: KstCommissioning
 
     def __init__(self, options: KstBus, models: Mapping[str, KstModel]) -> None:
         self.options = options
-        self.servos = {name: FittedServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
+        self.servos = {name: CalibratedServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.by_node = {servo.node: servo for servo in self.servos.values()}
         self.nodes = {name: servo.node for name, servo in self.servos.items()}
-        self.timing = FrameTiming.of(options)
-        self.commissioning = Commissioning(options, self.timing)
-        # Requests are immutable, and the same few are said again and again.
+        self.settings = RequestSettings.of(options)
+        self.commissioning = KstCommissioning(options, self.settings)
+        # Requests are immutable, so each is made once.
         self._state_reads = {
             (name, part): self._state_read(name, part) for name in self.servos for part in ("feedback", "health")
         }
@@ -50,64 +51,67 @@ class KstDriver(Driver):
     def step(self, servo: str) -> float:
         return self.servos[servo].calibration.unit_per_step
 
-    # Who is there
+    # Addressing
 
     def ping(self, node: int) -> Request[int | None]:
-        """Read id (3.4). There is no status byte."""
-        return Read(self.timing, node, Command.READ_ID, _nothing)
+        """Return a read of the id (KST RS422, 3.4); its value is None, because a reply has no status byte."""
+        return Read(self.settings, node, Command.READ_ID, _nothing)
 
     def unused(self) -> Request[Any]:
         first, last = self.options.id_range
         free = (node for node in range(last, first - 1, -1) if node not in self.by_node)
-        return Read(self.timing, next(free, last), Command.READ_ID, _nothing, once=True)
+        return Read(self.settings, next(free, last), Command.READ_ID, _nothing, once=True)
 
     def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
-        """There is one form of each read only, so fences take turns: the answer to a fence that was given up must not be taken
-        for the next one's. An enabled servo that stands where nobody sent it has restarted."""
-        used = list(avoid)
-        for _ in range(FENCE_TRIES - 1):
-            command = fence_command(used)
-            try:
-                return (yield from self._recover(node, command, enabled))
-            except ReplyTimeout:
-                used += (command, Command.READ_POSITION)
-        return (yield from self._recover(node, fence_command(used), enabled))
+        """Send a fence, then read the position of an enabled servo: outside its travel range it has restarted.
 
-    def _recover(self, node: int, command: Command, enabled: Collection[str]) -> Plan[bool]:
-        yield from ask(Fence(self.timing, node, command, self.commissioning.own_ids(node)))
+        Each read has only one form. So the fences take turns, and a position read without a reply may be under way as well.
+        """
+        return fence.fence(
+            partial(self._fence, node, enabled),
+            FENCES,
+            avoid,
+            after_failure=(Command.READ_POSITION,),
+            retry_on=ReplyTimeout,
+        )
+
+    def _fence(self, node: int, enabled: Collection[str], command: Command) -> Plan[bool]:
+        yield from ask(Fence(self.settings, node, command, self.commissioning.own_ids(node)))
         servo = self.by_node.get(node)
         if servo is None or not enabled:
             return True
         try:
-            # Once: behind the fence, nothing would tell the answer to a second question from that to the first.
-            servo.seen((yield from ask(Read(self.timing, node, Command.READ_POSITION, decode_position, once=True))))
+            # Not repeated: nothing would tell the reply to a second read from that to the first.
+            servo.travel.read((yield from ask(Read(self.settings, node, Command.READ_POSITION, decode_position, once=True))))
         except DeviceError:
-            return True  # it refuses to say
-        return not servo.jumped
+            return True  # it answers, and does not report its position
+        return not servo.travel.jumped
 
     def inspect(self, node: int) -> Plan[Identity]:
-        return identity.inspect(self.timing, node)
+        result = yield from identity.inspect(self.settings, node)
+        self.commissioning.answered(node)
+        return result
 
     def identify(self, servo: str) -> Plan[Identity]:
         return self._identify(self.servos[servo])
 
-    def _identify(self, servo: FittedServo) -> Plan[Identity]:
-        seen = yield from identity.identify(self.timing, servo.node)
-        notes = [*seen.notes]
+    def _identify(self, servo: CalibratedServo) -> Plan[Identity]:
+        result = yield from identity.identify(self.settings, servo.node)
+        notes = [*result.notes]
         if servo.node in self.commissioning.pending:
             notes.append(str(self.commissioning.pending[servo.node]))
-        if self.options.sdo_order == "auto" and self.timing.aborts.learned == "le":
-            notes.append("its abort codes come low byte first, not as the specification prints them")
-        return replace(seen, mode="position", notes=tuple(notes))
+        if self.options.sdo_order == "auto" and self.settings.aborts.learned == "le":
+            notes.append("its abort codes come low byte first, not as the document prints them")
+        return replace(result, mode="position", notes=tuple(notes))
 
     # Reading
 
     def read_state(self, servo: str) -> Request[dict[str, Update]]:
-        """The position: it is the only thing one question can bring."""
+        """Return the read of the position, the only field that one request can bring."""
         return self._state_reads[servo, "feedback"]
 
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
-        """One read per servo: position for feedback, status for health."""
+        """Return one read for each servo: the position for feedback, the status for health."""
         return [
             Poll(part, hz, (node,), partial(self._poll_request, servo, part))
             for part, hz in rates.items()
@@ -117,116 +121,112 @@ class KstDriver(Driver):
     def _poll_request(self, servo: str, part: str, reachable: Collection[int]) -> Request[dict[str, Update]] | None:
         return self._state_reads[servo, part] if self.nodes[servo] in reachable else None
 
-    def _state_read(self, servo: str, part: str) -> Request[dict[str, Update]]:
-        fitted = self.servos[servo]
+    def _state_read(self, name: str, part: str) -> Request[dict[str, Update]]:
+        servo = self.servos[name]
         if part == "feedback":
-            command, decode = Command.READ_POSITION, fitted.decode_position
+            command, decode = Command.READ_POSITION, servo.decode_position
         else:
-            command, decode = Command.READ_STATUS, fitted.decode_status
-        return Read(self.timing, fitted.node, command, lambda data: {servo: decode(data)})
+            command, decode = Command.READ_STATUS, servo.decode_status
+        return Read(self.settings, servo.node, command, lambda data: {name: decode(data)})
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
-        known = self._reads.get((servo, register, raw))
-        if known is not None:
-            return known
-        fitted = self.servos[servo]
-        command = Command(fitted.model.readable(register).address)
-        makers = {
-            Command.READ_ID: _first,
-            Command.READ_POSITION: fitted.position_of if raw else fitted.position,
-            Command.READ_STATUS: _word,
-            Command.READ_VERSION: _double_word if raw else version_text,
-        }
-        request = self._reads[servo, register, raw] = Read(self.timing, fitted.node, command, makers[command])
-        return request
+        key = (servo, register, raw)
+        if key not in self._reads:
+            target = self.servos[servo]
+            command = Command(target.model.readable(register).address)
+            makers = {
+                Command.READ_ID: _first_byte,
+                Command.READ_POSITION: target.read_steps if raw else target.read_position,
+                Command.READ_STATUS: partial(_integer, 2),
+                Command.READ_VERSION: partial(_integer, 4) if raw else version_text,
+            }
+            self._reads[key] = Read(self.settings, target.node, command, makers[command])
+        return self._reads[key]
 
     # Writing
 
     def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:
-        """Nothing can be written by name: there is no memory table. Raises NotSupported, UnknownName."""
-        found = self.servos[servo].model.writable(register)
-        raise NotSupported(f"{found.name} is not written by hand: {VERBS[found.name]}", servo=servo)
+        """Refuse: a KST servo has no memory table. Raises NotSupported, UnknownName."""
+        name = self.servos[servo].model.writable(register).name
+        raise NotSupported(f"{name} cannot be written as a register: {OTHER_VERBS[name]}", servo=servo)
 
     # Motion
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Opens the host's gate: reads the position and writes nothing, for there is no torque command, and a reading that is
-        not the goal would move the servo if it were written."""
-        fitted = self.servos[servo]
-        raw = yield from ask(Read(self.timing, fitted.node, Command.READ_POSITION, fitted.position_of))
-        self.timing.aborts.faulty.discard(fitted.node)
-        fitted.enabled(raw)
-        return fitted.to_unit(raw)
+        """Read the position, and write nothing: there is no torque command, and to write a reading that is not the servo's goal
+        would move it."""
+        target = self.servos[servo]
+        raw = yield from ask(Read(self.settings, target.node, Command.READ_POSITION, target.read_steps))
+        self.settings.aborts.faulty.discard(target.node)
+        target.travel.begin(raw)
+        return target.to_unit(raw)
 
     def disable(self, servo: str) -> Plan[StopReport]:
         return goals.disable(self.servos[servo])
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
-        return goals.stop(self.timing, [(self.servos[target.servo], target) for target in targets])
+        return goals.stop(self.settings, [(self.servos[target.servo], target) for target in targets])
 
     def check_goal(self, goal: ServoGoal) -> None:
         if goal.servo not in self.servos:
             raise UnknownName(f"no servo {goal.servo} on this bus")
-        servo, wanted = self.servos[goal.servo], goal.goal
-        if wanted.kind != "position":
-            raise NotSupported("a KST servo does positions only: give it a position", servo=servo.name)
-        for what, value in (("acceleration", wanted.acceleration), ("effort", wanted.effort)):
+        servo = self.servos[goal.servo]
+        if goal.goal.kind != "position":
+            raise NotSupported("a KST servo has positions only: give it a position", servo=servo.name)
+        for name, value in (("acceleration", goal.goal.acceleration), ("effort", goal.goal.effort)):
             if value is not None:
-                raise NotSupported(f"{what}: a KST servo has no command for it: take it out", servo=servo.name)
-        if wanted.speed == 0 and not servo.options.allow_max_speed:
-            raise LimitError("speed 0 means no limit: give a speed, or set allow_max_speed", servo=servo.name)
-        goals.refuse_faulty(self.timing, servo)
-        servo.to_raw(wanted.value)
+                raise NotSupported(f"{name}: a KST servo has no command for it: take it out", servo=servo.name)
+        goals.refuse_faulty(self.settings, servo)
+        servo.to_raw(goal.goal.value)
         self.host_speed(goal)
 
     def host_speed(self, goal: ServoGoal) -> float | None:
-        """The goal's own speed, else the servo's, else its greatest, else the model's: left alone it goes as fast as it can."""
-        servo, wanted = self.servos[goal.servo], goal.goal
-        if wanted.speed == 0:
-            return None
-        if goal.start is None:
-            raise LimitError("its position is not known, so it cannot be led anywhere: read the servo first", servo=servo.name)
-        if wanted.duration is None:
-            return wanted.speed or servo.default_speed
-        return abs(wanted.value - goal.start) / wanted.duration or None
+        """Return the speed (unit/s) that the host keeps on the way; None: no limit. Left alone, a servo is as fast as it can
+        be."""
+        servo = self.servos[goal.servo]
+        speed = goal_speed(goal, servo.options, servo.model_speed)
+        if speed and goal.start is None:
+            raise LimitError(
+                "its position is not known, so the host cannot keep its speed: read the servo first", servo=servo.name
+            )
+        return speed or None
 
     def plan_goals(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
-        """Each goal is confirmed by its echo, asked for or not."""
-        steps = [(self.servos[goal.servo], self.servos[goal.servo].to_raw(goal.goal.value)) for goal in goals_]
-        return goals.turns(self.timing, steps, together=together)
+        """Return one plan for each goal, or one for all. Each goal is confirmed by its reply, with or without `confirm`."""
+        return goals.plan_setpoints(self.settings, self._setpoints(goals_), together=together)
+
+    def _setpoints(self, goals_: Sequence[ServoGoal]) -> list[goals.Setpoint]:
+        return [(self.servos[goal.servo], self.servos[goal.servo].to_raw(goal.goal.value)) for goal in goals_]
+
+    def preview_goals(self, goals_: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
+        return [goals.set_position(self.settings, servo, raw) for servo, raw in self._setpoints(goals_)]
+
+    def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
+        servos = [self.servos[target.servo] for target in targets]
+        return [goals.set_position(self.settings, servo, servo.range[0]) for servo in servos]
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
-        """Bits of the status bytes that the config names, and what the host has found out itself."""
-        fitted = self.servos[servo]
-        bits = fitted.status if status is None else status
-        names = {**fitted.model.status_bits, **self.options.status_bits}
-        found = [name for bit, name in sorted(names.items()) if bits is not None and bits >> bit & 1]
+        """Return the status bits that the config names, and the faults that the host has found out."""
+        target = self.servos[servo]
+        bits = target.status if status is None else status
+        names = {**target.model.status_bits, **self.options.status_bits}
+        named = [name for bit, name in sorted(names.items()) if bits is not None and bits >> bit & 1]
         own = {
-            "hardware fault": fitted.node in self.timing.aborts.faulty,
-            "outside range": fitted.outside,
-            "restarted": fitted.jumped,
-            "pending_reboot": fitted.node in self.commissioning.pending,
+            "hardware fault": target.node in self.settings.aborts.faulty,
+            "outside range": target.outside,
+            "restarted": target.travel.jumped,
+            "pending_reboot": target.node in self.commissioning.pending,
         }
-        return (*found, *(name for name, holds in own.items() if holds))
-
-
-def fence_command(avoid: Sequence[Hashable]) -> Command:
-    """A read that no reply under way can belong to; when all are taken, the one asked longest ago (`avoid` is oldest first)."""
-    free = (command for command in FENCES if command not in avoid)
-    return next(free, None) or next(Command(key) for key in avoid if key in FENCES)
+        return (*named, *(name for name, is_set in own.items() if is_set))
 
 
 def _nothing(data: bytes) -> int | None:
     return None
 
 
-def _first(data: bytes) -> int:
+def _first_byte(data: bytes) -> int:
     return data[0]
 
 
-def _word(data: bytes) -> int:
-    return int.from_bytes(data[:2], "little")
-
-
-def _double_word(data: bytes) -> int:
-    return int.from_bytes(data[:4], "little")
+def _integer(size: int, data: bytes) -> int:
+    return int.from_bytes(data[:size], "little")

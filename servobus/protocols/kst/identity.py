@@ -1,7 +1,7 @@
-"""Who answers at an address: firmware version, and whether it is one servo or two.
+"""Who answers at an address: the firmware version, and whether it may be two servos.
 
-Every new servo has the id 0x25, so two of them on one line speak at once. Nothing in the protocol tells; what can be seen are
-answers that are garbled or differ while nothing moves. That makes a clash suspected; it is never excluded.
+Every new servo has the id 0x25, so two of them on one line reply at once. The protocol cannot tell that. What shows it are
+replies that are garbled, or that differ while nothing moves. So a clash can be suspected, and is never excluded.
 """
 
 from __future__ import annotations
@@ -14,45 +14,45 @@ from typing import TypeVar
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import FACTORY_ID, Command, decode_position, version_text
-from servobus.protocols.kst.requests import FrameTiming, Read
+from servobus.protocols.kst.requests import Read, RequestSettings
 from servobus.values import Identity
 
 R = TypeVar("R")
 
-LOOKS = 5
-"""Reads of version and position each."""
-STILL = 10
-"""Steps that a servo at rest may seem to move between two reads."""
+ROUNDS = 5
+"""Reads of the version and of the position."""
+JITTER = 10
+"""Steps by which two readings of a servo at rest may differ."""
 
 
 @dataclass(slots=True)
-class Sighting:
-    """What was heard from one address when it was asked several times."""
+class Observation:
+    """What one address answered when it was asked several times."""
 
     node: int
     at_rest: bool = True
-    """It should not move meanwhile; else only to and fro is strange."""
+    """It does not move meanwhile. Of a servo that may move, only movement in both directions is suspicious."""
     versions: list[bytes] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
     missed: int = 0
-    """Questions that brought no whole answer."""
+    """Requests without a valid reply."""
 
     def reasons(self) -> Iterator[str]:
         if self.missed:
-            yield f"{self.missed} of {2 * LOOKS} answers were garbled or missing"
+            yield f"{self.missed} of {2 * ROUNDS} replies were garbled or missing"
         if len(set(self.versions)) > 1:
-            yield "it says different firmware versions"
+            yield "it reports different firmware versions"
         if self._jumps():
             yield f"its position jumps between {min(self.positions)} and {max(self.positions)} steps"
 
     def _jumps(self) -> bool:
-        ways = [later - earlier for earlier, later in pairwise(self.positions)]
-        to, fro = any(way > STILL for way in ways), any(way < -STILL for way in ways)
-        return to or fro if self.at_rest else to and fro
+        changes = [later - earlier for earlier, later in pairwise(self.positions)]
+        up, down = any(change > JITTER for change in changes), any(change < -JITTER for change in changes)
+        return up or down if self.at_rest else up and down
 
     @property
     def suspicion(self) -> str:
-        """Why there may be two servos, and what to do; empty: nothing speaks for it."""
+        """Why it may be two servos, and what to do; empty where nothing suggests it."""
         reasons = ", ".join(self.reasons())
         if not reasons:
             return ""
@@ -66,44 +66,44 @@ class Sighting:
         return version_text(self.versions[0]) if self.versions else None
 
 
-def look(timing: FrameTiming, node: int, *, at_rest: bool = True) -> Plan[Sighting]:
-    """Ask several times. Raises ReplyTimeout where nothing answers at all."""
-    seen = Sighting(node, at_rest)
+def observe(settings: RequestSettings, node: int, *, at_rest: bool = True) -> Plan[Observation]:
+    """Ask an address for its version and position several times. Raises ReplyTimeout where nothing answers at all."""
+    result = Observation(node, at_rest)
     error: ReplyTimeout | None = None
-    for _ in range(LOOKS):
+    for _ in range(ROUNDS):
         for question in (
-            _note(seen.versions, Read(timing, node, Command.READ_VERSION, _version, once=True)),
-            _note(seen.positions, Read(timing, node, Command.READ_POSITION, decode_position, once=True)),
+            _append(result.versions, Read(settings, node, Command.READ_VERSION, _version, once=True)),
+            _append(result.positions, Read(settings, node, Command.READ_POSITION, decode_position, once=True)),
         ):
             try:
                 yield from question
-            except ReplyTimeout as missed:
-                seen.missed, error = seen.missed + 1, missed
+            except ReplyTimeout as timeout:
+                result.missed, error = result.missed + 1, timeout
             except DeviceError:
-                continue  # a refusal is one servo's clear word
-    if error is not None and seen.missed == 2 * LOOKS:
+                continue  # a refusal is a valid reply of one servo
+    if error is not None and result.missed == 2 * ROUNDS:
         raise error
-    return seen
+    return result
 
 
-def _note(heard: list[R], request: Read[R]) -> Plan[None]:
-    heard.append((yield from ask(request)))
+def _append(values: list[R], request: Read[R]) -> Plan[None]:
+    values.append((yield from ask(request)))
 
 
-def inspect(timing: FrameTiming, node: int, *, at_rest: bool = True) -> Plan[Identity]:
-    """For a scan: with the question whether it is one servo."""
-    seen = yield from look(timing, node, at_rest=at_rest)
-    return Identity(model="kst", firmware=seen.firmware, notes=tuple(filter(None, (seen.suspicion,))))
+def inspect(settings: RequestSettings, node: int, *, at_rest: bool = True) -> Plan[Identity]:
+    """Identify an address for a scan, and check whether it may be two servos."""
+    result = yield from observe(settings, node, at_rest=at_rest)
+    return Identity(model="kst", firmware=result.firmware, notes=tuple(filter(None, (result.suspicion,))))
 
 
-def identify(timing: FrameTiming, node: int) -> Plan[Identity]:
-    """For a configured servo: in short, unless it has the id of every new one."""
+def identify(settings: RequestSettings, node: int) -> Plan[Identity]:
+    """Identify a configured servo: by one read, unless it has the id of every new servo."""
     if node == FACTORY_ID:
-        return (yield from inspect(timing, node, at_rest=False))
+        return (yield from inspect(settings, node, at_rest=False))
     try:
-        firmware = version_text((yield from ask(Read(timing, node, Command.READ_VERSION, _version))))
+        firmware = version_text((yield from ask(Read(settings, node, Command.READ_VERSION, _version))))
     except DeviceError:
-        firmware = None  # it answers, and does not know that command
+        firmware = None  # it answers, and does not have that command
     return Identity(model="kst", firmware=firmware)
 
 

@@ -1,7 +1,7 @@
-"""The commands of the seed's section 3 as requests that know their reply.
+"""The commands of KST RS422, 3, as requests that know their reply.
 
-A reply names its servo and the command it answers, so the replies that can be mistaken for each other are those to the same
-command: that is the `reply_key`. An own request heard back is never taken for a reply, because the codes differ.
+A reply names its servo and the command that it answers. So replies can only be confused if they answer the same command: that is
+the `reply_key`. An echo is never taken for a reply, because their codes differ.
 """
 
 from __future__ import annotations
@@ -11,34 +11,34 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from servobus.errors import EchoMismatch, NotSupported
+from servobus.errors import EchoMismatch
 from servobus.protocols.base import Request
 from servobus.protocols.kst.aborts import AbortReader
-from servobus.protocols.kst.codec import BROADCAST, REFUSED, REPLY, SAVE_WORD, SIZE, VERSION, Command, Frame, encode, name_of
+from servobus.protocols.kst.codec import REFUSED, REPLY, SAVE_DATA, SIZE, VERSION, Command, Frame, encode, name_of
 from servobus.protocols.kst.options import KstBus
 
 R = TypeVar("R")
 
 TURNAROUND = 0.005
-"""Seconds within which a servo that answers without need is expected to begin; the documents name no time."""
+"""Seconds within which a reply that is not needed is expected to begin; the document gives no time."""
 
 
 @dataclass(frozen=True, slots=True)
-class FrameTiming:
-    """What every request of a bus has in common."""
+class RequestSettings:
+    """What all requests of a bus share. Times in seconds."""
 
     aborts: AbortReader = field(default_factory=AbortReader)
     version: int = VERSION
     gap: float = 0.0
-    """Seconds of silence after each answer."""
+    """Silence after each reply."""
     guard: float = SIZE * 10 / 512_000 + TURNAROUND
-    """Seconds of silence after what is not answered: time for an answer that comes nevertheless."""
-    settle: float = 0.2
-    """Seconds a servo needs for its flash."""
+    """Silence after a command whose reply is not waited for: long enough for a reply that comes nevertheless."""
+    flash_time: float = 0.2
+    """How long a servo needs to write its flash."""
     strict_echo: bool = True
 
     @classmethod
-    def of(cls, options: KstBus) -> FrameTiming:
+    def of(cls, options: KstBus) -> RequestSettings:
         return cls(
             AbortReader(options.sdo_order),
             options.version_byte,
@@ -50,18 +50,18 @@ class FrameTiming:
 
 
 class KstRequest(Request[R]):
-    """A command that is answered by one frame."""
+    """A command to one servo, answered by one frame."""
 
-    def __init__(self, timing: FrameTiming, node: int, command: int, data: bytes = b"") -> None:
-        self.timing = timing
+    def __init__(self, settings: RequestSettings, node: int, command: int, data: bytes = b"") -> None:
+        self.settings = settings
         self.node = node
         self.command = command
         self.data = data
-        self.frame = encode(node, command, data, timing.version)
-        self.nodes = (node,) if node != BROADCAST else ()
+        self.frame = encode(node, command, data, settings.version)
+        self.nodes = (node,)
         self.reply_size = SIZE
         self.reply_key: int = command
-        self.quiet_after = timing.gap
+        self.quiet_after = settings.gap
 
     def answers(self, reply: Frame) -> bool:
         return reply.address == self.node and reply.code in (REPLY + self.command, REFUSED + self.command)
@@ -69,25 +69,25 @@ class KstRequest(Request[R]):
     def parse(self, replies: Sequence[Frame]) -> R:
         reply = replies[0]
         if reply.refused:
-            raise self.timing.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
+            raise self.settings.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
         return self.decode(reply)
 
     @abstractmethod
     def decode(self, reply: Frame) -> R:
-        """The value of a reply that is no refusal."""
+        """Return the value of a reply that is not a refusal."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.frame.hex(' ')})"
 
 
 class Read(KstRequest[R]):
-    """Read id, position, status or version (3.4, 3.6 to 3.8); `make` makes the value of the eight data bytes."""
+    """Read id, position, status or version (KST RS422, 3.4, 3.6 to 3.8)."""
 
     def __init__(
-        self, timing: FrameTiming, node: int, command: Command, make: Callable[[bytes], R], *, once: bool = False
+        self, settings: RequestSettings, node: int, command: Command, make: Callable[[bytes], R], *, once: bool = False
     ) -> None:
-        """`once`: not said again when no answer comes."""
-        super().__init__(timing, node, command)
+        """`make`: returns the value in the eight data bytes. `once`: it is not repeated when no reply comes."""
+        super().__init__(settings, node, command)
         self.idempotent = not once
         self._make = make
 
@@ -96,14 +96,16 @@ class Read(KstRequest[R]):
 
 
 class Fence(KstRequest[None]):
-    """A read whose answer shows that all earlier ones have left the servo; a refusal shows that as well. Not repeated: the next
-    fence has another command, or its answer could be that of this one."""
+    """A read whose reply, also a refusal, shows that all earlier replies have left the servo.
+
+    It is not repeated: the next fence needs another command, or this one's late reply could answer it.
+    """
 
     idempotent = False
 
-    def __init__(self, timing: FrameTiming, node: int, command: Command, ids: Collection[int]) -> None:
-        """`ids`: what the servo may say its id is."""
-        super().__init__(timing, node, command)
+    def __init__(self, settings: RequestSettings, node: int, command: Command, ids: Collection[int]) -> None:
+        """`ids`: the ids that the servo may report as its own."""
+        super().__init__(settings, node, command)
         self._ids = ids
 
     def answers(self, reply: Frame) -> bool:
@@ -111,18 +113,18 @@ class Fence(KstRequest[None]):
         return own and super().answers(reply)
 
     def parse(self, replies: Sequence[Frame]) -> None:
-        """Any answer will do."""
+        """Accept any reply."""
 
     def decode(self, reply: Frame) -> None:
-        """It has no value."""
+        """Return nothing."""
 
 
-class Confirmed(KstRequest[None]):
-    """A set: its reply brings back what was sent (3.1, 3.2, 3.5)."""
+class SetValue(KstRequest[None]):
+    """A set command, whose reply repeats its data (KST RS422, 3.1, 3.2, 3.5)."""
 
-    def __init__(self, timing: FrameTiming, node: int, command: Command, data: bytes, *, also: int | None = None) -> None:
-        """`also`: another address the answer may come from."""
-        super().__init__(timing, node, command, data)
+    def __init__(self, settings: RequestSettings, node: int, command: Command, data: bytes, *, also: int | None = None) -> None:
+        """`also`: another address from which the reply may come."""
+        super().__init__(settings, node, command, data)
         self.idempotent = command == Command.SET_POSITION
         self._also = also
 
@@ -132,70 +134,42 @@ class Confirmed(KstRequest[None]):
         return super().answers(reply)
 
     def decode(self, reply: Frame) -> None:
-        heard = reply.data[: len(self.data)]
-        if self.timing.strict_echo and heard != self.data:
+        repeated = reply.data[: len(self.data)]
+        if self.settings.strict_echo and repeated != self.data:
             raise EchoMismatch(
-                f"{name_of(self.command)}: {heard.hex(' ')} was confirmed, {self.data.hex(' ')} was sent: read it back before "
-                "the next one (echo_check: off believes it)",
+                f"{name_of(self.command)}: {repeated.hex(' ')} was confirmed, {self.data.hex(' ')} was sent: read it back before "
+                "the next one (echo_check: off accepts it)",
                 request=self,
                 raw=reply.frame,
             )
 
 
 class Save(KstRequest[None]):
-    """Save (3.3), where an answer is waited for. Wears the flash, so it is never repeated."""
+    """Save, where a reply is waited for (KST RS422, 3.3). Never repeated, because it wears the flash."""
 
     idempotent = False
 
-    def __init__(self, timing: FrameTiming, node: int) -> None:
-        super().__init__(timing, node, Command.SAVE, SAVE_WORD)
-        self.service_time = self.quiet_after = timing.settle
+    def __init__(self, settings: RequestSettings, node: int) -> None:
+        super().__init__(settings, node, Command.SAVE, SAVE_DATA)
+        self.service_time = self.quiet_after = settings.flash_time
 
     def decode(self, reply: Frame) -> None:
-        """Whatever it brings: the seed knows no data of it."""
+        """Return nothing: the document defines no data for this reply."""
 
 
-class Tell(KstRequest[None]):
-    """A command whose answer nobody waits for; the line stays silent for the time that one would take."""
+class UnansweredCommand(KstRequest[None]):
+    """A command whose reply is not waited for; the line stays silent as long as a reply would take."""
 
     replies = 0
 
-    def __init__(self, timing: FrameTiming, node: int, command: Command, data: bytes = b"") -> None:
-        super().__init__(timing, node, command, data)
+    def __init__(self, settings: RequestSettings, node: int, command: Command, data: bytes = b"") -> None:
+        super().__init__(settings, node, command, data)
         self.nodes = ()
         self.idempotent = command == Command.SET_POSITION
-        self.quiet_after = max(timing.guard, timing.settle if command == Command.SAVE else 0.0)
+        self.quiet_after = max(settings.guard, settings.flash_time if command == Command.SAVE else 0.0)
 
     def parse(self, replies: Sequence[Frame]) -> None:
-        """It has no answer."""
+        """Return nothing."""
 
     def decode(self, reply: Frame) -> None:
-        """It has no answer."""
-
-
-class Broadcast(KstRequest[Frame | None]):
-    """A command to all. Waits for no answer, unless the config says that the only servo of the line gives one. Raises
-    NotSupported for what must not be said to all."""
-
-    idempotent = False
-
-    def __init__(self, timing: FrameTiming, options: KstBus, command: Command, data: bytes = b"") -> None:
-        if command not in options.broadcast_allow:
-            raise NotSupported(
-                f"{name_of(command)} is not said to all, for every servo would obey or answer at once: name one, or see "
-                "broadcast_allow"
-            )
-        super().__init__(timing, BROADCAST, command, data)
-        if options.broadcast_reply == "ignore":
-            self.replies = 0
-            self.quiet_after = timing.guard
-
-    def answers(self, reply: Frame) -> bool:
-        """From whatever address."""
-        return reply.code in (REPLY + self.command, REFUSED + self.command)
-
-    def parse(self, replies: Sequence[Frame]) -> Frame | None:
-        return super().parse(replies) if replies else None
-
-    def decode(self, reply: Frame) -> Frame:
-        return reply
+        """Return nothing."""

@@ -1,8 +1,7 @@
-"""One configured KST servo: its options, its model, its calibration, and where it may be now.
+"""One configured KST servo: its options, its model, its calibration, and where it can be.
 
-The protocol does not tell whether read position (3.6) brings where the servo stands or where it was sent; it is shown as
-`position` and nothing here depends on which it is. Nor does it tell of a restart, after which the servo goes to its default
-position. What can be seen of one: the servo stands where nobody sent it.
+The document does not say whether "read position" (KST RS422, 3.6) returns where the servo is or where it was sent. It is shown as
+`position`, and nothing here depends on which it is.
 """
 
 from __future__ import annotations
@@ -14,13 +13,66 @@ from servobus.protocols.kst.options import KstServo
 from servobus.values import Update
 
 JUMP_DEG = 5.0
-"""How far off its way a servo may be before it must have restarted: more than load and overshoot explain."""
-DIGITS = 6
-"""Decimal places of a step that a number keeps, so that 0.15 degrees lie in the middle between two steps, as it is written."""
+"""How far outside its travel range a servo may be read before it must have restarted: more than load and overshoot explain."""
+DECIMALS = 6
+"""Decimal places of a step that count, so that 0.15 degrees are exactly between two steps, as they are written."""
 
 
-class FittedServo:
-    """Knows how this servo says what, and remembers what of it no command can read."""
+class Travel:
+    """Where a servo can be, in steps: between its last reading and the goals sent since.
+
+    The protocol reports no restart. After one, the servo goes to its default position. So a servo that is read outside its travel
+    range has restarted, and `jumped` stays set until it is enabled again. A restart without movement cannot be detected.
+    """
+
+    def __init__(self, jump: int) -> None:
+        """`jump`: steps outside the range that a reading may have."""
+        self.last: int | None = None
+        """The last reading."""
+        self.range: tuple[int, int] | None = None
+        """None: others may move the servo too, so its readings show nothing."""
+        self.jumped = False
+        self._jump = jump
+        self._goals: tuple[int, ...] = ()
+        """The goals it may be travelling to: the lowest and the highest since the last one that it confirmed, and the last."""
+
+    def begin(self, raw: int) -> None:
+        """The servo is here, and from now on only goals of ours move it."""
+        self.last, self.range, self.jumped, self._goals = raw, (raw, raw), False, ()
+
+    def end(self) -> None:
+        """From now on others may move it."""
+        self.range, self._goals = None, ()
+
+    def send(self, raw: int) -> None:
+        """A goal is about to leave; the servo may obey it, whether it confirms it or not."""
+        if self.range is not None:
+            self.range = min(self.range[0], raw), max(self.range[1], raw)
+            goals = (*self._goals, raw)
+            self._goals = min(goals), max(goals), raw
+
+    def confirm(self, raw: int) -> None:
+        """The servo has confirmed this goal, so earlier ones do not count any more."""
+        if self.range is not None:
+            self._goals = (raw,)
+
+    def read(self, raw: int) -> None:
+        """The servo was read here."""
+        self.last = raw
+        if self.range is not None:
+            low, high = self.range
+            self.jumped = self.jumped or not low - self._jump <= raw <= high + self._jump
+            ends = (raw, *self._goals)
+            self.range = min(ends), max(ends)
+
+    @property
+    def goal(self) -> int | None:
+        """The last goal sent."""
+        return self._goals[-1] if self._goals else None
+
+
+class CalibratedServo:
+    """Translates between a servo's unit and the steps on the wire, and keeps what the servo last reported."""
 
     def __init__(self, name: str, options: KstServo, model: KstModel) -> None:
         self.name = name
@@ -30,32 +82,20 @@ class FittedServo:
         self.calibration = options.calibration(model)
         degree = model.units["deg"]
         self.range = model.range if options.range_deg is None else tuple(round(end / degree) for end in options.range_deg)
-        """Steps it may be sent to."""
-        self.setpoint: int | None = None
-        """The last goal (steps) it confirmed since it was enabled."""
+        """Minimum and maximum goal, in steps."""
+        self.model_speed = abs(self.calibration.rate_to_unit(model.default_speed))
+        """The model's default speed, in unit/s."""
         self.status: int | None = None
         """The two status bytes as last read."""
         self.outside = False
-        """The last position read was outside its range, though not so far that it is not believed."""
-        self.jumped = False
-        """It was seen where nobody sent it since it was enabled."""
-        self._jump = round(JUMP_DEG / degree)
-        self._last: int | None = None
-        """Where it was last seen (steps)."""
-        self._way: tuple[int, int] | None = None
-        """While it is enabled: between which steps it may be."""
-
-    @property
-    def default_speed(self) -> float:
-        """Unit/s on the way to a goal that names none."""
-        default = abs(self.calibration.rate_to_unit(self.model.default_speed))
-        return self.options.speed or self.options.max_speed or default
+        """The last position read was outside the range, but close enough to be accepted."""
+        self.travel = Travel(round(JUMP_DEG / degree))
 
     # Positions
 
     def to_raw(self, position: float) -> int:
-        """Nearest step, ties to even. Raises LimitError outside the range, however little."""
-        exact = round(self.calibration.zero + self.calibration.direction * position / self.calibration.unit_per_step, DIGITS)
+        """Return the nearest step, ties to even. Raises LimitError outside the range, however little."""
+        exact = round(self.calibration.zero + self.calibration.direction * position / self.calibration.unit_per_step, DECIMALS)
         if not self.range[0] <= exact <= self.range[1]:
             ends = sorted(self.to_unit(end) for end in self.range)
             raise LimitError(
@@ -67,62 +107,49 @@ class FittedServo:
     def to_unit(self, raw: int) -> float:
         return round(self.calibration.to_unit(raw), 9)
 
-    def position_of(self, data: bytes) -> int:
-        """Steps in the data of a reply. Raises DeviceError for what no servo of this model can say."""
+    def read_steps(self, data: bytes) -> int:
+        """Return the position in a reply, in steps. Raises DeviceError for a position that this model cannot have."""
         raw = decode_position(data)
-        least, greatest = self.model.believed
-        if not least <= raw <= greatest:
+        low, high = self.model.believed
+        if not low <= raw <= high:
             raise DeviceError(
-                f"reads position {raw} steps, beyond {least} to {greatest}: garbled, or turned past its stop. Read again",
+                f"reads position {raw} steps, beyond {low} to {high}: garbled, or turned past its stop. Read again",
                 servo=self.name,
             )
         self.outside = not self.range[0] <= raw <= self.range[1]
-        self.seen(raw)
+        self.travel.read(raw)
         return raw
 
-    def position(self, data: bytes) -> float:
-        return self.to_unit(self.position_of(data))
+    def read_position(self, data: bytes) -> float:
+        """Return the position in a reply, in the servo's unit."""
+        return self.to_unit(self.read_steps(data))
+
+    def hold_steps(self, setpoint: float | None) -> int | None:
+        """Return the goal (steps) that stops the servo; None: it has to be read first.
+
+        * The servo may have restarted, or others may move it: the last reading. Its old goal would move it.
+        * The setpoint is known: that, inside the travel range. Setpoints of a ramp are one step of the ramp apart, so this is
+          where it is, or nearly.
+        * Otherwise: the last goal sent, else the last reading.
+        """
+        travel = self.travel
+        raw = travel.last
+        if travel.range is not None and not travel.jumped:
+            if setpoint is not None:
+                raw = _clamp(self.calibration.to_raw(setpoint), travel.range)
+            elif travel.goal is not None:
+                raw = travel.goal
+        return None if raw is None else _clamp(raw, self.range)
 
     # Fields of State
 
     def decode_position(self, data: bytes) -> Update:
-        return {"position": self.position(data)}
+        return {"position": self.read_position(data)}
 
     def decode_status(self, data: bytes) -> Update:
         self.status = int.from_bytes(data[:2], "little")
         return {"status": self.status}
 
-    # Where it may be
 
-    def enabled(self, raw: int) -> None:
-        """It stands here, and from now on moves only where it is sent."""
-        self._last, self.setpoint, self.jumped, self._way = raw, None, False, (raw, raw)
-
-    def disabled(self) -> None:
-        """From now on others may move it."""
-        self._way = None
-
-    @property
-    def resting_place(self) -> int | None:
-        """The goal (steps) that stops it: the last it confirmed, else where it was last seen. None: neither is known."""
-        known = self._last if self.setpoint is None or self.jumped else self.setpoint
-        return None if known is None else min(max(known, self.range[0]), self.range[1])
-
-    def sent(self, raw: int) -> None:
-        """A goal left for it, and may have been obeyed."""
-        if self._way is not None:
-            self._way = min(self._way[0], raw), max(self._way[1], raw)
-
-    def confirmed(self, raw: int) -> None:
-        self.setpoint = raw
-
-    def seen(self, raw: int) -> None:
-        """It stands here: somewhere between where it was seen before and the goals since, or it has restarted."""
-        self._last = raw
-        if self._way is None:
-            return
-        least, greatest = self._way
-        if not least - self._jump <= raw <= greatest + self._jump:
-            self.jumped = True
-        ends = (raw, raw if self.setpoint is None else self.setpoint)
-        self._way = min(ends), max(ends)
+def _clamp(raw: int, limits: tuple[int, ...]) -> int:
+    return min(max(raw, limits[0]), limits[1])

@@ -12,8 +12,7 @@ from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.kst.codec import Frame, KstCodec, encode
 from servobus.protocols.kst.driver import KstDriver
-from servobus.protocols.kst.model import KstModel
-from servobus.protocols.kst.model_loading import packaged_model
+from servobus.protocols.kst.model import KstModel, packaged_model
 from servobus.protocols.kst.options import KstBus
 from servobus.protocols.kst.simulated.device import KstDevice, devices
 from servobus.simulation.line import blend

@@ -8,7 +8,7 @@ import pytest
 
 from servobus.errors import DeviceError, NotSupported
 from servobus.protocols.kst import aborts
-from servobus.protocols.kst.aborts import ABORTS, ADVICE, AbortReader, class_of, decode, words
+from servobus.protocols.kst.aborts import ABORTS, ADVICE, AbortReader, abort_text, decode, error_class
 
 SEED = """
 0503 0000	Toggle bit not alternated
@@ -75,7 +75,7 @@ def test_every_code_in_either_order(code: int, order: Literal["big", "little"]) 
     data = code.to_bytes(4, order)
     reader = AbortReader()
     error = reader.error(7, "set position", data + bytes(4), raw=b"frame")
-    assert type(error) is KINDS.get(code, DeviceError) is class_of(code)
+    assert type(error) is KINDS.get(code, DeviceError) is error_class(code)
     assert (error.code, error.raw) == (code, b"frame")
     assert f"set position was refused: {code >> 16:04X} {code & 0xFFFF:04X} {ABORTS[code]}; {ADVICE[type(error)]}" == str(error)
     assert reader.learned == ("be" if order == "big" else "le")
@@ -106,7 +106,7 @@ def test_a_set_order_is_not_doubted() -> None:
 
 def test_an_unknown_code_is_shown_as_its_bytes() -> None:
     error = AbortReader().error(7, "save", b"\x01\x02\x03\x04\0\0\0\0")
-    assert words(0x01020304, b"\1\2\3\4") == "unknown abort code, bytes 01 02 03 04"
+    assert abort_text(0x01020304, b"\1\2\3\4") == "unknown abort code, bytes 01 02 03 04"
     assert "unknown abort code, bytes 01 02 03 04" in str(error)
     assert (type(error), error.code) == (DeviceError, 0x01020304)
 

@@ -16,7 +16,7 @@ from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.kst import DEFINITION
-from servobus.protocols.kst.commissioning import Commissioning
+from servobus.protocols.kst.commissioning import KstCommissioning
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.protocols.options import FaultOptions
@@ -124,15 +124,16 @@ async def test_a_servo_that_restarts_is_disabled() -> None:
 @virtual
 async def test_an_id_is_changed_in_a_session() -> None:
     async with running() as (bus, servos, _), bus.exclusive() as session:
-        plan = commissioning(bus).set_id(1, 9, save=True)
-        change = await bus.perform(plan, 1, urgent=True, session=session)
+        change = await bus.perform(commissioning(bus).set_id(1, 9, save=True), 1, urgent=True, session=session)
         assert change.saved
         servos[0].reboot(bus.clock())
         await asyncio.sleep(1)
         assert servos[0].node == 9
-        assert await bus.perform(commissioning(bus).restarted(1), 9, urgent=True, session=session) == 9
+        plan = commissioning(bus).restarted(1)
+        assert plan is not None
+        assert await bus.perform(plan, 9, urgent=True, session=session) == 9
 
 
-def commissioning(bus: BusService) -> Commissioning:
+def commissioning(bus: BusService) -> KstCommissioning:
     assert isinstance(bus.driver, KstDriver)
     return bus.driver.commissioning

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from servobus.protocols.kst.codec import (
     DATA_SIZE,
+    DATA_SIZES,
     SIZE,
-    USED,
     Command,
     Frame,
     KstCodec,
@@ -115,10 +115,10 @@ def test_another_version_byte_is_no_frame_unless_it_is_the_one_set() -> None:
     assert found(READ, codec=KstCodec(0xCB)) == []
 
 
-@pytest.mark.parametrize(("code", "used"), [(code, used) for code, used in USED.items() if used < DATA_SIZE])
-def test_unused_data_bytes_must_be_zero_unless_that_is_ignored(code: int, used: int) -> None:
+@pytest.mark.parametrize(("code", "size"), [(code, size) for code, size in DATA_SIZES.items() if size < DATA_SIZE])
+def test_unused_data_bytes_must_be_zero_unless_that_is_ignored(code: int, size: int) -> None:
     """K14."""
-    full, over = encode(1, code, b"\1" * used), encode(1, code, b"\1" * (used + 1))
+    full, over = encode(1, code, b"\1" * size), encode(1, code, b"\1" * (size + 1))
     assert found(full, over, codec=KstCodec()) == [full]
     assert found(full, over, codec=KstCodec(strict=False)) == [full, over]
 
@@ -147,10 +147,14 @@ def test_reset_forgets_what_was_heard() -> None:
 
 @steady
 @given(
-    st.integers(0, 255), st.sampled_from(sorted(USED)), st.binary(max_size=DATA_SIZE), st.binary(max_size=30), st.integers(0, 99)
+    st.integers(0, 255),
+    st.sampled_from(sorted(DATA_SIZES)),
+    st.binary(max_size=DATA_SIZE),
+    st.binary(max_size=30),
+    st.integers(0, 99),
 )
 def test_what_is_encoded_is_found_again(address: int, code: int, data: bytes, junk: bytes, seed: int) -> None:
-    data = data[: USED[code]]
+    data = data[: DATA_SIZES[code]]
     frame = encode(address, code, data)
     codec = KstCodec()
     assert found(*chopped(frame + junk, "random", seed), codec=codec)[0] == frame
@@ -250,7 +254,7 @@ def test_frames_in_words(frame: bytes, text: str) -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\xfe", REPLY[:-1], REPLY + b"\0", b"\0" + REPLY, b"\x1b[2J"])
 def test_what_is_no_frame_is_shown_in_hexadecimal(data: bytes) -> None:
-    assert KstCodec().describe(data, sent=False) == f"no KST frame: {data.hex(' ')}"
+    assert KstCodec().describe(data, sent=False) == f"not a KST frame: {data.hex(' ')}"
 
 
 def test_commands_have_the_names_of_the_specification() -> None:

@@ -9,7 +9,7 @@ import pytest
 from servobus.protocols.base import Request, run_plan
 from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.codec import BAUD_TABLE, FACTORY_ID, Command, decode_position, encode, encode_position, version_text
-from servobus.protocols.kst.requests import Confirmed, Fence, FrameTiming, Read, Save, Tell
+from servobus.protocols.kst.requests import Fence, Read, RequestSettings, Save, SetValue, UnansweredCommand
 from tests.protocols.kst.bench import Bench, device_of, frame_of, tell
 
 # Section 3.5: position, High, Low.
@@ -40,54 +40,54 @@ def test_what_a_new_servo_is_set_to() -> None:
     assert sorted(DEFINITION.baudrates) == sorted(BAUD_TABLE.values())
 
 
-WIRE = FrameTiming()
+SETTINGS = RequestSettings()
 # Name of the request, its frame as sections 2 and 3 lay it out (sums computed), the reply's frame, the value.
 LAYOUTS: list[tuple[Request[Any], str, str, Any]] = [
     (
-        Confirmed(WIRE, 0x25, Command.SET_BAUD, b"\6"),
+        SetValue(SETTINGS, 0x25, Command.SET_BAUD, b"\6"),
         "FE CA 25 06 06 00000000000000 FB 0A",
         "FE CA 25 46 06 00000000000000 3B 0A",
         None,
     ),
     (
-        Confirmed(WIRE, 0x25, Command.SET_ID, b"\5"),
+        SetValue(SETTINGS, 0x25, Command.SET_ID, b"\5"),
         "FE CA 25 08 05 00000000000000 FC 0A",
         "FE CA 25 48 05 00000000000000 3C 0A",
         None,
     ),
     (
-        Read(WIRE, 0x25, Command.READ_ID, lambda data: data[0]),
+        Read(SETTINGS, 0x25, Command.READ_ID, lambda data: data[0]),
         "FE CA 25 18 0000000000000000 07 0A",
         "FE CA 25 58 25 00000000000000 6C 0A",
         0x25,
     ),
     (
-        Confirmed(WIRE, 0x25, Command.SET_POSITION, b"\x7c\xfc"),
+        SetValue(SETTINGS, 0x25, Command.SET_POSITION, b"\x7c\xfc"),
         "FE CA 25 09 7C FC 000000000000 70 0A",
         "FE CA 25 49 7C FC 000000000000 B0 0A",
         None,
     ),
     (
-        Read(WIRE, 0x25, Command.READ_POSITION, decode_position),
+        Read(SETTINGS, 0x25, Command.READ_POSITION, decode_position),
         "FE CA 25 19 0000000000000000 08 0A",
         "FE CA 25 59 93 FF 000000000000 DA 0A",
         -109,
     ),
     (
-        Read(WIRE, 0x25, Command.READ_STATUS, lambda data: data[:2]),
+        Read(SETTINGS, 0x25, Command.READ_STATUS, lambda data: data[:2]),
         "FE CA 25 10 0000000000000000 FF 0A",
         "FE CA 25 50 12 34 000000000000 85 0A",
         b"\x12\x34",
     ),
     (
-        Read(WIRE, 0x25, Command.READ_VERSION, version_text),
+        Read(SETTINGS, 0x25, Command.READ_VERSION, version_text),
         "FE CA 25 1A 0000000000000000 09 0A",
         "FE CA 25 5A 31 2E 30 30 00000000 08 0A",
         "1.00",
     ),
-    (Save(WIRE, 0x25), "FE CA 25 0F 73 61 76 65 00000000 AD 0A", "FE CA 25 4F 0000000000000000 3E 0A", None),
+    (Save(SETTINGS, 0x25), "FE CA 25 0F 73 61 76 65 00000000 AD 0A", "FE CA 25 4F 0000000000000000 3E 0A", None),
     (
-        Fence(WIRE, 0x25, Command.READ_ID, (0x25,)),
+        Fence(SETTINGS, 0x25, Command.READ_ID, (0x25,)),
         "FE CA 25 18 0000000000000000 07 0A",
         "FE CA 25 58 25 00000000000000 6C 0A",
         None,
@@ -123,7 +123,7 @@ def test_the_computed_frames(address: int, code: int, data: bytes, frame: str) -
 
 def test_save_needs_no_reply_and_gives_the_flash_its_time() -> None:
     """Section 3.3; K4."""
-    save = Tell(WIRE, 0x25, Command.SAVE, b"save")
+    save = UnansweredCommand(SETTINGS, 0x25, Command.SAVE, b"save")
     assert save.frame == bytes.fromhex("FECA250F7361766500000000AD0A")
     assert (save.replies, save.idempotent, save.quiet_after) == (0, False, 0.2)
 

@@ -28,7 +28,7 @@ def test_it_is_a_driver() -> None:
         ({"max_speed": 90, "speed": 45}, {}, 45.0),
         ({"max_speed": 90}, {"speed": 10.0}, 10.0),
         ({}, {"duration": 0.5}, 40.0),
-        ({}, {"duration": 0.5, "value": 10.0}, None),
+        ({}, {"duration": 0.5, "value": 10.0}, 60.0),  # no distance: the speed of a goal that names none
         ({"allow_max_speed": True}, {"speed": 0.0}, None),
     ],
 )

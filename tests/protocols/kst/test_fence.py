@@ -5,22 +5,23 @@ from __future__ import annotations
 import pytest
 
 from servobus.errors import ReplyTimeout
+from servobus.protocols.fence import choose_key
 from servobus.protocols.kst.codec import FACTORY_ID, Command, encode
-from servobus.protocols.kst.driver import FENCES, fence_command
+from servobus.protocols.kst.driver import FENCES
 from tests.protocols.kst.bench import Bench, frame_of, goal
 
 
 def test_a_fence_asks_for_the_id_unless_such_an_answer_is_under_way() -> None:
-    assert fence_command(()) == Command.READ_ID
-    assert fence_command((Command.SET_POSITION, Command.READ_POSITION)) == Command.READ_ID
-    assert fence_command((Command.READ_ID,)) == Command.READ_VERSION
-    assert fence_command((Command.READ_VERSION, Command.READ_ID)) == Command.READ_STATUS
+    assert choose_key(FENCES, ()) == Command.READ_ID
+    assert choose_key(FENCES, (Command.SET_POSITION, Command.READ_POSITION)) == Command.READ_ID
+    assert choose_key(FENCES, (Command.READ_ID,)) == Command.READ_VERSION
+    assert choose_key(FENCES, (Command.READ_VERSION, Command.READ_ID)) == Command.READ_STATUS
 
 
 @pytest.mark.parametrize("oldest", FENCES)
 def test_when_all_are_under_way_the_oldest_is_asked_again(oldest: Command) -> None:
     rest = [command for command in FENCES if command != oldest]
-    assert fence_command((Command.SET_POSITION, oldest, *rest)) == oldest
+    assert choose_key(FENCES, (Command.SET_POSITION, oldest, *rest)) == oldest
 
 
 def test_a_fence_that_was_not_answered_is_followed_by_another_kind() -> None:
@@ -67,10 +68,10 @@ def test_after_a_new_id_the_fence_knows_both() -> None:
     bench.run(bench.driver.commissioning.set_id(1, 7))
     assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames()[-1] == encode(1, Command.READ_ID)
-    bench.devices[0].says = {Command.READ_ID: b"\7"}
+    bench.devices[0].answers = {Command.READ_ID: b"\7"}
     assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames() == [encode(1, Command.READ_ID)]
-    bench.devices[0].says = {Command.READ_ID: b"\x08"}
+    bench.devices[0].answers = {Command.READ_ID: b"\x08"}
     assert bench.run(bench.driver.fence(1, [], ()))
     assert bench.frames() == [encode(1, Command.READ_ID), encode(1, Command.READ_VERSION)]
 

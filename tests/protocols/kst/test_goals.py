@@ -63,7 +63,6 @@ def test_what_one_servo_refuses_does_not_keep_the_others() -> None:
     assert isinstance(results["pan"], OutOfRange)
     assert results["pan"].servo == "pan"
     assert results["tilt"] is Outcome.ACKED
-    assert bench.driver.servos["pan"].setpoint is None
 
 
 def test_the_servo_goes_there_at_its_own_speed() -> None:
@@ -80,19 +79,18 @@ def test_a_goal_without_answer_is_said_again_and_then_given_up_as_perhaps_obeyed
     bench.loses = lambda request: True
     assert isinstance(move(bench, pan=10)["pan"], ReplyTimeout)
     assert bench.frames() == [position_frame(1, 100)] * 3
-    servo = bench.driver.servos["pan"]
-    assert servo.setpoint is None
-    servo.seen(100)
-    assert not servo.jumped
+    travel = bench.driver.servos["pan"].travel
+    travel.read(100)
+    assert not travel.jumped
 
 
 def test_a_wrong_echo_fails_the_goal() -> None:
     """K12."""
     bench = enabled()
-    bench.devices[0].says = {Command.SET_POSITION: encode_position(1)}
+    bench.devices[0].answers = {Command.SET_POSITION: encode_position(1)}
     assert isinstance(move(bench, pan=10)["pan"], EchoMismatch)
     lenient = enabled(echo_check="off")
-    lenient.devices[0].says = {Command.SET_POSITION: encode_position(1)}
+    lenient.devices[0].answers = {Command.SET_POSITION: encode_position(1)}
     assert move(lenient, pan=10)["pan"] is Outcome.ACKED
 
 
@@ -120,8 +118,11 @@ def test_a_stop_says_the_last_confirmed_setpoint_once_more() -> None:
     bench = enabled()
     move(bench, pan=10)
     bench.frames()
-    reports = bench.run(bench.driver.stop([target("pan"), target("tilt")]))
+    stop = [target("pan", setpoint=10.0), target("tilt", setpoint=0.0)]
+    reports = bench.run(bench.driver.stop(stop))
     assert reports == {"pan": StopReport("hold", True, True), "tilt": StopReport("hold", True, True)}
+    assert bench.frames() == [position_frame(1, 100), position_frame(2, 0)]
+    bench.run(bench.driver.stop([target("pan"), target("tilt")]))
     assert bench.frames() == [position_frame(1, 100), position_frame(2, 0)]
 
 
@@ -184,7 +185,7 @@ def test_a_servo_that_has_restarted_is_not_sent_back() -> None:
 
 def test_a_latched_fault_does_not_keep_a_stop_back() -> None:
     bench = enabled()
-    bench.driver.timing.aborts.faulty.add(1)
+    bench.driver.settings.aborts.faulty.add(1)
     assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed
 
 
@@ -193,3 +194,12 @@ def test_disable_closes_the_gate_and_says_nothing() -> None:
     bench = enabled()
     assert bench.run(bench.driver.disable("pan")) == StopReport("hold", False, True, HOLDS)
     assert bench.frames() == []
+
+
+def test_previews_are_the_frames_and_change_nothing() -> None:
+    bench = Bench()
+    goals = [goal("pan", 10), goal("tilt", -10)]
+    assert [request.frame for request in bench.driver.preview_goals(goals)] == [position_frame(1, 100), position_frame(2, -100)]
+    assert len(bench.driver.preview_stop([target("pan"), target("tilt")])) == 2
+    travels = [servo.travel for servo in bench.driver.servos.values()]
+    assert [(travel.last, travel.range, travel.jumped) for travel in travels] == [(None, None, False)] * 2

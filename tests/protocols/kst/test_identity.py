@@ -6,7 +6,7 @@ import pytest
 
 from servobus.errors import ReplyTimeout
 from servobus.protocols.kst.codec import FACTORY_ID, Command
-from servobus.protocols.kst.identity import LOOKS, STILL
+from servobus.protocols.kst.identity import JITTER, ROUNDS
 from tests.protocols.kst.bench import Bench, device_of
 
 
@@ -18,7 +18,7 @@ def test_one_servo_raises_no_suspicion() -> None:
     bench = factory_bench()
     seen = bench.run(bench.driver.inspect(FACTORY_ID))
     assert (seen.model, seen.firmware, seen.notes) == ("kst", "1.00", ())
-    assert len(bench.said) == 2 * LOOKS
+    assert len(bench.said) == 2 * ROUNDS
 
 
 def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
@@ -26,7 +26,7 @@ def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
     bench = factory_bench()
     bench.devices.append(device_of(position=111))
     (note,) = bench.run(bench.driver.inspect(FACTORY_ID)).notes
-    assert note.startswith("two servos with id 37 (0x25, the id of every new servo) are suspected: 5 of 10 answers were garbled")
+    assert note.startswith("two servos with id 37 (0x25, the id of every new servo) are suspected: 5 of 10 replies were garbled")
     assert "Connect them one at a time" in note
 
 
@@ -40,7 +40,7 @@ def test_two_servos_whose_answers_agree_or_melt_into_one_cannot_be_told_apart(po
 
 def test_different_versions_are_suspected() -> None:
     bench = Bench()
-    turns = iter(range(2 * LOOKS))
+    turns = iter(range(2 * ROUNDS))
 
     def another_speaks(request: object) -> bool:
         bench.devices[0].firmware = b"1.00" if next(turns) % 4 > 1 else b"2.00"
@@ -48,15 +48,15 @@ def test_different_versions_are_suspected() -> None:
 
     bench.loses = another_speaks
     (note,) = bench.run(bench.driver.inspect(1)).notes
-    assert "it says different firmware versions" in note
+    assert "it reports different firmware versions" in note
     assert "0x25" not in note
 
 
-@pytest.mark.parametrize(("way", "suspected"), [(STILL, False), (STILL + 1, True)])
+@pytest.mark.parametrize(("way", "suspected"), [(JITTER, False), (JITTER + 1, True)])
 def test_a_position_that_jumps_is_suspected(way: int, suspected: bool) -> None:
     bench = Bench()
 
-    turns = iter(range(2 * LOOKS))
+    turns = iter(range(2 * ROUNDS))
 
     def jump(request: object) -> bool:
         device = bench.devices[0]
@@ -95,7 +95,7 @@ def test_where_nothing_answers_there_is_nobody() -> None:
     bench = Bench()
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.inspect(3))
-    assert len(bench.said) == 2 * LOOKS
+    assert len(bench.said) == 2 * ROUNDS
 
 
 def test_a_configured_servo_is_asked_in_short_unless_it_has_the_factory_id() -> None:
@@ -108,7 +108,7 @@ def test_a_configured_servo_is_asked_in_short_unless_it_has_the_factory_id() -> 
 
 def test_a_learned_byte_order_is_told() -> None:
     bench = Bench()
-    bench.driver.timing.aborts.code(b"\x30\x00\x09\x06")
+    bench.driver.settings.aborts.code(b"\x30\x00\x09\x06")
     assert "low byte first" in bench.run(bench.driver.identify("pan")).notes[0]
     told = Bench(sdo_order="le")
     assert told.run(told.driver.identify("pan")).notes == ()

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from servobus.errors import ConfigError
 from servobus.protocols.kst import codec
 from servobus.protocols.kst.codec import BAUD_TABLE, encode
-from servobus.protocols.kst.model_loading import FILES, load_models, packaged_model
-from servobus.protocols.kst.requests import TURNAROUND, FrameTiming
+from servobus.protocols.kst.model import FILES, load_models, packaged_model
+from servobus.protocols.kst.requests import TURNAROUND, RequestSettings
 from tests.protocols.kst.bench import bus_options, changed_model
 
 
@@ -26,7 +26,7 @@ def test_the_defaults_are_the_safe_choices() -> None:
     """K1 to K19, where they are a key of the bus."""
     options = bus_options()
     assert (options.baudrate, options.duplex) == (512_000, "half")
-    assert (options.sdo_order, options.broadcast_reply, options.broadcast_allow) == ("auto", "ignore", [0x09])
+    assert options.sdo_order == "auto"
     assert (options.save_reply, options.save_settle_ms, options.id_effective) == ("none", 200.0, "after_reboot")
     assert (options.version_byte, options.echo_check, options.pad_check) == (0xCA, "strict", "strict")
     assert (options.id_range, options.baud_table, options.status_bits, options.min_gap_us) == ((1, 254), BAUD_TABLE, {}, 0.0)
@@ -67,23 +67,9 @@ def test_id_255_is_there_for_those_who_ask() -> None:
     assert "greater than or equal to 1" in refusal(id_range=[0, 9])
 
 
-def test_only_set_position_is_said_to_several() -> None:
-    """K3."""
-    assert "only set position (0x09)" in refusal(broadcast_allow=[0x09, 0x18])
-    assert bus_options(broadcast_allow=[]).broadcast_allow == []
-    lone = bus_options({"pan": {"id": 1}}, broadcast_allow=[0x18], broadcast_reply="expect_one")
-    assert lone.broadcast_allow == [0x18]
-
-
-def test_an_answer_to_a_broadcast_needs_a_line_with_one_servo() -> None:
-    """K2."""
-    assert "for a single servo" in refusal(broadcast_reply="expect_one")
-    assert bus_options({}, broadcast_reply="expect_one").servos == {}
-
-
 def test_a_rate_the_servos_do_not_have_is_refused() -> None:
     """K18."""
-    assert "baudrate: 1000000 is none of the servos' rates 9600, 19200" in refusal(baudrate=1_000_000)
+    assert "baudrate: 1000000 is not one of the servos' rates 9600, 19200" in refusal(baudrate=1_000_000)
     assert bus_options(baudrate=1_000_000, baud_table={8: 1_000_000}).baudrate == 1_000_000
     assert bus_options(baudrate=921_600).baudrate == 921_600
 
@@ -117,13 +103,13 @@ def test_the_codec_follows_the_options() -> None:
 
 
 def test_what_requests_take_from_the_options() -> None:
-    timing = FrameTiming.of(
+    settings = RequestSettings.of(
         bus_options(baudrate=9600, min_gap_us=250, save_settle_ms=50, echo_check="off", sdo_order="le", version_byte=1)
     )
-    assert (timing.gap, timing.settle, timing.strict_echo, timing.version) == (250e-6, 0.05, False, 1)
-    assert timing.guard == 14 * 10 / 9600 + TURNAROUND
-    assert timing.aborts.learned == "le"
-    assert FrameTiming.of(bus_options()).guard == FrameTiming().guard
+    assert (settings.gap, settings.flash_time, settings.strict_echo, settings.version) == (250e-6, 0.05, False, 1)
+    assert settings.guard == 14 * 10 / 9600 + TURNAROUND
+    assert settings.aborts.learned == "le"
+    assert RequestSettings.of(bus_options()).guard == RequestSettings().guard
 
 
 # Models
@@ -162,7 +148,7 @@ def test_a_model_needs_degrees_and_commands() -> None:
     with pytest.raises(ValidationError, match="deg must be there"):
         changed_model(units={"rad": 0.1})
     registers = packaged_model().model_dump()["registers"]
-    with pytest.raises(ValidationError, match="status has address 0x11, which is no command"):
+    with pytest.raises(ValidationError, match="status has address 0x11, which is not a command"):
         changed_model(registers={**registers, "status": {"address": 0x11}})
 
 

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from servobus.errors import DeviceError, LimitError
 from servobus.protocols.kst.codec import encode_position
-from servobus.protocols.kst.model_loading import packaged_model
+from servobus.protocols.kst.model import packaged_model
 from servobus.protocols.kst.options import KstServo
-from servobus.protocols.kst.servo import FittedServo
+from servobus.protocols.kst.servo import CalibratedServo
 from tests.protocols.kst.bench import steady
 
 
-def fitted(**options: Any) -> FittedServo:
-    return FittedServo("pan", KstServo.model_validate({"id": 1, **options}), packaged_model())
+def fitted(**options: Any) -> CalibratedServo:
+    return CalibratedServo("pan", KstServo.model_validate({"id": 1, **options}), packaged_model())
 
 
 def steps(raw: int) -> bytes:
@@ -96,7 +96,7 @@ def test_other_units() -> None:
 def test_every_step_comes_back(raw: int) -> None:
     servo = fitted()
     assert servo.to_raw(servo.to_unit(raw)) == raw
-    assert servo.position(steps(raw)) == raw / 10
+    assert servo.read_position(steps(raw)) == raw / 10
 
 
 @steady
@@ -123,8 +123,8 @@ def test_a_reading_slightly_outside_is_flagged_and_far_outside_not_believed(raw:
 
 def test_the_flag_goes_when_it_is_back() -> None:
     servo = fitted()
-    servo.position_of(steps(905))
-    servo.position_of(steps(900))
+    servo.read_steps(steps(905))
+    servo.read_steps(steps(900))
     assert not servo.outside
 
 
@@ -139,71 +139,90 @@ def test_status_bytes_are_raw() -> None:
 
 
 @pytest.mark.parametrize(("raw", "jumped"), [(350, False), (351, True), (50, False), (49, True)])
-def test_it_has_jumped_when_it_stands_where_nobody_sent_it(raw: int, jumped: bool) -> None:
+def test_a_servo_outside_its_travel_range_has_jumped(raw: int, jumped: bool) -> None:
     """K21: on the way from 10 to 30 degrees, and five more on each side, anything is possible."""
-    servo = fitted()
-    servo.enabled(100)
-    servo.sent(300)
-    servo.confirmed(300)
-    servo.seen(raw)
-    assert servo.jumped is jumped
+    travel = fitted().travel
+    travel.begin(100)
+    travel.send(300)
+    travel.confirm(300)
+    travel.read(raw)
+    assert travel.jumped is jumped
 
 
 def test_all_goals_since_the_last_reading_count() -> None:
-    servo = fitted()
-    servo.enabled(0)
+    travel = fitted().travel
+    travel.begin(0)
     for raw in (300, -200, 100):
-        servo.sent(raw)
-        servo.confirmed(raw)
-    found = []
+        travel.send(raw)
+        travel.confirm(raw)
+    jumped = []
     for raw in (290, 150, -100):
-        servo.seen(raw)
-        found.append(servo.jumped)
-    assert found == [False, False, True]
+        travel.read(raw)
+        jumped.append(travel.jumped)
+    assert jumped == [False, False, True]
 
 
 def test_a_goal_that_may_have_been_obeyed_counts_as_well() -> None:
-    servo = fitted()
-    servo.enabled(0)
-    servo.sent(500)
-    servo.seen(480)
-    assert not servo.jumped
-    assert servo.setpoint is None
+    """Also after a reading on the way to it, and until a later goal is confirmed."""
+    travel = fitted().travel
+    travel.begin(0)
+    travel.send(500)
+    travel.read(240)
+    travel.read(480)
+    assert not travel.jumped
+    travel.send(100)
+    travel.confirm(100)
+    travel.read(100)
+    travel.read(480)
+    assert travel.jumped
 
 
 def test_enabling_forgets_the_jump_and_disabling_the_question() -> None:
-    servo = fitted()
-    servo.enabled(0)
-    servo.seen(700)
-    found = [servo.jumped]
-    servo.enabled(700)
-    found.append(servo.jumped)
-    servo.disabled()
-    servo.sent(300)
-    servo.seen(0)
-    assert [*found, servo.jumped] == [True, False, False]
+    travel = fitted().travel
+    travel.begin(0)
+    travel.read(700)
+    jumped = [travel.jumped]
+    travel.begin(700)
+    jumped.append(travel.jumped)
+    travel.end()
+    travel.send(300)
+    travel.read(0)
+    assert [*jumped, travel.jumped] == [True, False, False]
 
 
-def test_the_resting_place_is_the_last_goal_it_confirmed_else_where_it_was_seen() -> None:
+def test_a_stop_holds_the_last_goal_sent_else_the_last_reading() -> None:
     servo = fitted()
-    places = [servo.resting_place]
+    travel = servo.travel
+    held = [servo.hold_steps(None)]
     steps: list[tuple[Callable[[int], None], int]] = [
-        (servo.seen, 120),
-        (servo.enabled, 150),
-        (servo.sent, 400),
-        (servo.confirmed, 400),
-        (servo.seen, 390),
-        (servo.seen, 0),  # restarted: to send it back to its goal would move it
+        (travel.read, 120),
+        (travel.begin, 150),
+        (travel.send, 400),
+        (travel.confirm, 400),
+        (travel.read, 390),
+        (travel.read, 0),  # restarted: to send it back to its goal would move it
     ]
     for step, raw in steps:
         step(raw)
-        places.append(servo.resting_place)
-    assert places == [None, 120, 150, 150, 400, 400, 0]
+        held.append(servo.hold_steps(None))
+    assert held == [None, 120, 150, 400, 400, 400, 0]
 
 
-def test_the_resting_place_is_inside_the_range() -> None:
+def test_a_stop_holds_the_setpoint_inside_the_travel_range() -> None:
+    """A setpoint that never left for the servo, such as the end of a ramp, moves nothing."""
     servo = fitted()
-    servo.seen(940)
-    assert servo.resting_place == 900
-    servo.seen(-940)
-    assert servo.resting_place == -900
+    assert servo.hold_steps(20.0) is None  # others may have moved it: it is read first
+    servo.travel.begin(100)
+    servo.travel.send(150)
+    servo.travel.read(120)
+    assert [servo.hold_steps(position) for position in (13.0, 15.0, 60.0, -60.0)] == [130, 150, 150, 120]
+    servo.travel.read(-300)
+    assert servo.hold_steps(13.0) == -300
+
+
+def test_what_a_stop_holds_is_inside_the_servos_range() -> None:
+    servo = fitted()
+    servo.travel.read(940)
+    assert servo.hold_steps(None) == 900
+    servo.travel.read(-940)
+    assert servo.hold_steps(None) == -900

@@ -1,9 +1,9 @@
-"""A simulated KST servo: the seed's section 3 from the other end of the line.
+"""A simulated KST servo: the device's end of KST RS422, 3.
 
-Where the specification is silent it does this: what is no known command, or not addressed to it, gets no answer; of broadcasts it
-obeys set position alone and answers none; a value it cannot take is refused with an abort code of 0609; a new id or rate is
-kept aside until a restart, and lost by it unless it was saved; after a restart it goes to its default position. Each of these
-can be changed by an attribute, at any time.
+Where the document is silent: an unknown command, and one for another address, gets no reply. Of broadcasts, only set position is
+obeyed, and none is answered. A value out of range is refused with an abort code of 0609. A new id or rate takes effect at a
+restart if it was saved, and is lost otherwise. After a restart the servo goes to its default position. Attributes change each of
+these at any time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from servobus.protocols.kst.codec import (
     FACTORY_ID,
     REFUSED,
     REPLY,
-    SAVE_WORD,
+    SAVE_DATA,
     VERSION,
     Command,
     Frame,
@@ -32,10 +32,10 @@ from servobus.protocols.kst.options import KstBus
 
 TOO_HIGH, TOO_LOW, OUT_OF_RANGE = 0x06090031, 0x06090032, 0x06090030
 DELAY = 100e-6
-"""Seconds from command to reply; the documents name none."""
+"""Seconds from command to reply; the document gives none."""
 
 Answer: TypeAlias = bytes | int | None
-"""Data of the reply, an abort code, or silence."""
+"""Data of the reply, an abort code, or None for no reply."""
 
 
 class KstDevice:
@@ -57,7 +57,7 @@ class KstDevice:
         self.baudrate = baudrate
         self.version = version
         self.immediate = immediate
-        """A new id or rate is obeyed at once."""
+        """A new id or rate takes effect at once."""
         self.firmware = model.firmware.encode().ljust(4, b"\0")
         self.status_bytes = bytes(2)
         self.position = self.goal = float(position)
@@ -65,51 +65,50 @@ class KstDevice:
         self.speed = model.max_steps_per_second
         self.delay = DELAY
         self.extra_delay = 0.0
-        """Seconds that its answers come too late."""
+        """Seconds by which its replies are too late."""
         self.dead = False
-        """Hears and says nothing."""
+        """It neither receives nor replies."""
         self.refuses: dict[int, int] = {}
-        """Command -> abort code that it answers instead of obeying."""
-        self.says: dict[int, bytes] = {}
-        """Command -> data that it answers in place of the right ones."""
+        """Command -> abort code with which it refuses."""
+        self.answers: dict[int, bytes] = {}
+        """Command -> data that it replies instead of the right data."""
         self.sdo_order = "be"
         self.answers_save = False
-        self.answers_broadcasts = False
         self.reads_goal = False
-        """Read position brings the goal, not the place."""
+        """Read position returns the goal instead of the present position."""
         self._rates = dict(baud_table or BAUD_TABLE)
         self._new = self._stored = (servo_id, baudrate)
-        """Id and rate that were set, and that were saved."""
-        self._at = -math.inf
+        """Id and rate that were set, and those that were saved."""
+        self._moved_at = -math.inf
         self._awake = -math.inf
 
     def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
-        """Obey a command, and answer it where the rules of the protocol say so."""
-        everybody = packet.address == BROADCAST
-        verb = VERBS.get(packet.code)
-        if verb is None or self.dead or now < self._awake or not (everybody or packet.address == self.node):
+        """Obey a command; see `protocols.base.Device`."""
+        broadcast = packet.address == BROADCAST
+        handler = HANDLERS.get(packet.code)
+        if handler is None or self.dead or now < self._awake or not (broadcast or packet.address == self.node):
             return ()
-        if everybody and not (self.answers_broadcasts or packet.code == Command.SET_POSITION):
+        if broadcast and packet.code != Command.SET_POSITION:
             return ()
         self.advance(now)
         address = self.node
-        answer = self.refuses.get(packet.code) or verb(self, packet.data)
-        if answer is None or (everybody and not self.answers_broadcasts):
+        answer = self.refuses.get(packet.code) or handler(self, packet.data)
+        if answer is None or broadcast:
             return ()
         if isinstance(answer, bytes):
-            answer = self.says.get(packet.code, answer)
+            answer = self.answers.get(packet.code, answer)
         return (DeviceReply(self._reply(address, packet.code, answer), self.delay, late=self.extra_delay),)
 
     def advance(self, now: float) -> None:
-        """Be where it is at `now`."""
-        elapsed, self._at = now - self._at, max(now, self._at)
+        """Move to where it is at `now`."""
+        elapsed, self._moved_at = now - self._moved_at, max(now, self._moved_at)
         if 0 < elapsed < math.inf:
             left = self.goal - self.position
-            way = self.speed * elapsed
-            self.position = self.goal if abs(left) <= way else self.position + math.copysign(way, left)
+            step = self.speed * elapsed
+            self.position = self.goal if abs(left) <= step else self.position + math.copysign(step, left)
 
     def reboot(self, now: float) -> None:
-        """Off and on: what was not saved is lost, and the goal is the default position."""
+        """Switch off and on: what was not saved is lost, and the goal is the default position."""
         self.advance(now)
         self._awake = now + self.model.reboot_s
         self._new = self._stored
@@ -131,7 +130,7 @@ class KstDevice:
         return data[:1]
 
     def save(self, data: bytes) -> Answer:
-        if data[: len(SAVE_WORD)] != SAVE_WORD:
+        if data[: len(SAVE_DATA)] != SAVE_DATA:
             return None
         self._stored = self._new
         return b"" if self.answers_save else None
@@ -170,7 +169,7 @@ class KstDevice:
         return encode(address, REFUSED + command, code, self.version)
 
 
-VERBS: dict[int, Callable[[KstDevice, bytes], Answer]] = {
+HANDLERS: dict[int, Callable[[KstDevice, bytes], Answer]] = {
     Command.SET_BAUD: KstDevice.set_baud,
     Command.SET_ID: KstDevice.set_id,
     Command.SAVE: KstDevice.save,
@@ -183,8 +182,8 @@ VERBS: dict[int, Callable[[KstDevice, bytes], Answer]] = {
 
 
 def devices(options: KstBus, models: Mapping[str, KstModel]) -> list[KstDevice]:
-    """The servos of a bus, each standing at its zero."""
-    found = []
+    """Return the simulated servos of a bus, each at its zero position."""
+    result = []
     for servo in options.servos.values():
         model = models[servo.model]
         device = KstDevice(
@@ -198,6 +197,5 @@ def devices(options: KstBus, models: Mapping[str, KstModel]) -> list[KstDevice]:
         )
         device.sdo_order = "le" if options.sdo_order == "le" else "be"
         device.answers_save = options.save_reply == "required"
-        device.answers_broadcasts = options.broadcast_reply == "expect_one"
-        found.append(device)
-    return found
+        result.append(device)
+    return result

@@ -10,8 +10,8 @@ import pytest
 from servobus.protocols.base import Device
 from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.aborts import ABORTS
-from servobus.protocols.kst.codec import ASKS, FACTORY_ID, Command, encode, encode_position
-from servobus.protocols.kst.model_loading import load_models, packaged_model
+from servobus.protocols.kst.codec import FACTORY_ID, REQUEST_SIZES, Command, encode, encode_position
+from servobus.protocols.kst.model import load_models, packaged_model
 from tests.protocols.kst.bench import bus_options, device_of, frame_of, tell
 
 
@@ -25,7 +25,7 @@ def test_it_hears_only_its_own_address_and_commands() -> None:
     for address in range(256):
         assert (tell(device, Command.READ_ID, to=address) is not None) is (address == 5)
     answered = [code for code in range(256) if tell(device, code, b"save") is not None]
-    assert answered == sorted(set(ASKS) - {Command.SAVE})
+    assert answered == sorted(set(REQUEST_SIZES) - {Command.SAVE})
 
 
 def test_it_does_not_answer_replies() -> None:
@@ -38,9 +38,9 @@ def test_it_does_not_answer_replies() -> None:
 @pytest.mark.parametrize("order", ["be", "le"])
 def test_it_refuses_with_any_abort_code_on_demand(code: int, order: str) -> None:
     device = device_of()
-    device.refuses = dict.fromkeys(ASKS, code)
+    device.refuses = dict.fromkeys(REQUEST_SIZES, code)
     device.sdo_order = order
-    for command in ASKS:
+    for command in REQUEST_SIZES:
         reply = tell(device, command, b"save")
         assert reply is not None
         assert (reply.code, reply.data[:4]) == (0xC0 + command, code.to_bytes(4, "big" if order == "be" else "little"))
@@ -92,17 +92,11 @@ def test_it_moves_at_a_finite_speed_and_stays_where_it_was_sent() -> None:
 def test_only_set_position_is_obeyed_as_a_broadcast_and_never_answered() -> None:
     """K2, K3."""
     device = device_of(servo_id=5)
-    for command in ASKS:
+    for command in REQUEST_SIZES:
         assert tell(device, command, b"\x2c\x01", to=0) is None
     assert (device.goal, device.node) == (300, 5)
     device.reboot(0.0)
     assert (device.node, device.baudrate) == (5, 512_000)
-
-
-def test_it_answers_broadcasts_where_it_is_told_to() -> None:
-    device = device_of(servo_id=5)
-    device.answers_broadcasts = True
-    assert tell(device, Command.READ_ID, to=0) == frame_of(encode(5, 0x58, b"\5"))
 
 
 def test_what_was_not_saved_is_lost_by_a_restart_and_silence_goes_with_it() -> None:
@@ -148,7 +142,6 @@ def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> Non
         version_byte=0xCB,
         sdo_order="le",
         save_reply="required",
-        broadcast_reply="expect_one",
         id_effective="immediate",
     )
     (device,) = DEFINITION.devices(options, load_models(options, Path()))
@@ -156,17 +149,11 @@ def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> Non
     kst = device_of()
     assert isinstance(device, type(kst))
     assert (device.position, device.version, device.sdo_order, device.answers_save) == (120, 0xCB, "le", True)
-    assert (device.answers_broadcasts, device.immediate) == (True, True)
+    assert device.immediate
     defaults = bus_options()
     for servo in DEFINITION.devices(defaults, load_models(defaults, Path())):
         assert isinstance(servo, type(kst))
-        assert (servo.position, servo.sdo_order, servo.answers_save, servo.answers_broadcasts, servo.immediate) == (
-            0,
-            "be",
-            False,
-            False,
-            False,
-        )
+        assert (servo.position, servo.sdo_order, servo.answers_save, servo.immediate) == (0, "be", False, False)
 
 
 def test_the_entry_speaks_for_the_folder() -> None:
