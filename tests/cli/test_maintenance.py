@@ -55,7 +55,7 @@ def test_a_new_baud_rate(capsys: pytest.CaptureFixture[str]) -> None:
         (["set-id", "gimbal", "99", "40"], 1, "no answer"),
         (["set-id", "leg", "1", "2"], 2, "no bus 'leg': there are gimbal, arm"),
         (["set-id", "arm", "1", "2"], 2, "with the vendor's tool"),
-        (["set-baud", "gimbal", "37", "31250"], 2, "baud rate 31250 is none of"),
+        (["set-baud", "gimbal", "37", "31250"], 2, "baud rate 31250 is not one of"),
         (["set-baud", "arm", "1", "115200"], 2, "with the vendor's tool"),
     ],
 )
