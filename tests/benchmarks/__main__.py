@@ -10,10 +10,16 @@ from collections.abc import Callable
 
 import structlog
 
-from tests.benchmarks import door, kst, turns
+from tests.benchmarks import door, goals, kst, start, turns
 from tests.benchmarks.report import Report
 
-BENCHMARKS: dict[str, Callable[[float, int], Report]] = {"turns": turns.main, "kst": kst.main, "door": door.main}
+BENCHMARKS: dict[str, Callable[[float, int], Report]] = {
+    "turns": turns.main,
+    "goals": goals.main,
+    "start": start.main,
+    "kst": kst.main,
+    "door": door.main,
+}
 """Each takes the seconds of a round and the number of rounds."""
 
 
