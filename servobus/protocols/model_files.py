@@ -1,8 +1,8 @@
-"""Model files: those packaged with a protocol, and users' own beside a config, which may extend a packaged one."""
+"""Reads model files: those packaged with a protocol, and the user's own beside a config, which may extend a packaged one."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -26,21 +26,25 @@ class ModelFiles(Generic[M]):
 
     @cached_property
     def packaged(self) -> Mapping[str, M]:
-        """By name."""
+        """The packaged models by name."""
         models = (self.read(path) for path in sorted(self.folder.glob(f"*{SUFFIX}")))
         return {model.name: model for model in models}
 
     def find(self, name: str, folder: Path) -> M:
-        """A packaged model, or the own file of that name, looked for from `folder` on. Raises ConfigError."""
+        """Return a packaged model, or the model in the user's file of that name (relative to `folder`). Raises ConfigError."""
         if name in self.packaged:
             return self.packaged[name]
         if not name.endswith(SUFFIX):
-            known = ", ".join(self.packaged)
-            raise ConfigError(f"model {reader.clip(name)!r} is not known; there are {known}, or name a file *{SUFFIX}")
+            names = ", ".join(self.packaged)
+            raise ConfigError(f"model {reader.clip(name)!r} is not known; there are {names}, or name a file *{SUFFIX}")
         return self.read(folder / name)
 
+    def load(self, names: Iterable[str], folder: Path) -> dict[str, M]:
+        """Return the models of these names; see `find`."""
+        return {name: self.find(name, folder) for name in dict.fromkeys(names)}
+
     def read(self, path: Path) -> M:
-        """The model in a file. Raises ConfigError with the places of what is wrong."""
+        """Return the model in a file. Raises ConfigError, which names the line of each problem."""
         document = reader.read(path)
         problems = Problems(document)
         data = document.data
@@ -52,19 +56,19 @@ class ModelFiles(Generic[M]):
         return model
 
     def _extended(self, data: Mapping[str, Any], problems: Problems) -> Any:
-        """The packaged model of that name, with what this file says instead."""
+        """Return the packaged model that the file extends, changed by the file's own keys."""
         base = data["extends"]
-        known = [path.stem for path in sorted(self.folder.glob(f"*{SUFFIX}"))]
-        if base not in known:
-            problems.add(("extends",), f"found {quote(base)}; there are {', '.join(known)}")
+        names = [path.stem for path in sorted(self.folder.glob(f"*{SUFFIX}"))]
+        if base not in names:
+            problems.add(("extends",), f"found {quote(base)}; there are {', '.join(names)}")
             problems.raise_any()
-        if base not in self._data:  # it takes long to read
+        if base not in self._data:  # reading it takes long
             self._data[base] = reader.read(self.folder / f"{base}{SUFFIX}").data
         return merged(self._data[base], {key: value for key, value in data.items() if key != "extends"})
 
 
 def merged(base: Any, change: Any) -> Any:
-    """Mappings key by key, everything else as the change says."""
+    """Return `base` with the changes: mappings are merged key by key, everything else is replaced."""
     if not (isinstance(base, Mapping) and isinstance(change, Mapping)):
         return change
     return {**base, **{key: merged(base.get(key), value) for key, value in change.items()}}

@@ -187,7 +187,7 @@ def test_scan_with_bad_arguments(arguments: tuple[str, ...], told: str, call: Ca
         (("read", "knee"), "no servo 'knee': there are arm/shoulder"),
         (("read", "elbow"), "on several buses: say one of arm/elbow, leg/elbow"),
         (("read", "shoulder", "temprature"), "has no register 'temprature'"),
-        (("read", "shoulder", "300:2"), "no span of the memory table"),
+        (("read", "shoulder", "300:2"), "give ADDR:LEN with LEN 1 to 250"),
         (("move", "shoulder=91"), "outside -90 to 90"),
         (("move", "shoulder=nan"), "not a finite number"),
         (("move", "shoulder=inf"), "not a finite number"),

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from servobus.protocols.options import BusOptions, PollRates, ServoOptions
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 
 BUS = {"protocol": "sms", "port": "sim:", "baudrate": 115200}
 

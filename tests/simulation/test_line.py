@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager, closing
 import pytest
 
 from servobus.protocols.sms.codec import BROADCAST_ID, Instruction, SmsCodec, encode
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.simulation.line import SimulatedLine, blend, overlay
 from tests.virtual_time import virtual

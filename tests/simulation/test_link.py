@@ -11,7 +11,7 @@ import pytest
 from servobus.errors import ConfigError
 from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction, encode
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.simulation.link import SimulatedLink, has_wire_time, simulated_link

@@ -12,7 +12,7 @@ import pytest
 import serial
 
 from servobus.protocols.sms.codec import BROADCAST_ID, Instruction, encode
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.simulation.serve import serve
 

@@ -1,15 +1,15 @@
-"""FEETECH SMS 1.0 and its relatives (STS, SCS): the seed's instruction packets on RS485 or TTL."""
+"""FEETECH SMS 1.0 and its relatives (STS, SCS): instruction packets on RS485 or TTL."""
 
 from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.sms.codec import MAX_ID, SmsCodec, node_of, rename
 from servobus.protocols.sms.driver import SmsDriver
-from servobus.protocols.sms.model_loading import load_models
+from servobus.protocols.sms.model import load_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.device import devices
 
 
 def codec(options: SmsBus | None) -> SmsCodec:
-    """The same for every bus, and at both ends."""
+    """Return a codec; it is the same for every bus and for both ends."""
     return SmsCodec()
 
 
@@ -22,7 +22,7 @@ DEFINITION = ProtocolDefinition(
     devices=devices,
     rename=rename,
     node_of=node_of,
-    # feetech.md, section 5: what the families ship with comes first.
+    # The rates that the families are shipped with come first.
     baudrates=(1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400, 19_200, 14_400, 9_600, 4_800),
     scan_ids=range(MAX_ID + 1),
 )

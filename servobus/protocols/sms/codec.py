@@ -1,7 +1,7 @@
-"""SMS 1.0 packets (seed 1.1 to 1.4): header FF FF, id, length, instruction or status, parameters, checksum.
+"""SMS 1.0 packets (1.1 to 1.4): header FF FF, id, length, instruction or status, parameters, checksum.
 
-Both directions have the same shape, so one codec serves master and simulated servo: `Packet.code` is the instruction of a request
-and the health byte of a reply. Which instructions are answered is a table (`ANSWERED`), not a habit of the code.
+Both directions have the same shape, so one codec serves the master and the simulated servo: `Packet.code` is the instruction of a
+request and the health byte of a reply. Two tables say which instructions are answered: `WRITES` and `ANSWERED_BROADCASTS`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from enum import IntEnum
 from random import Random
 from typing import NamedTuple
+
+from servobus.protocols.stream import StreamCodec, decode_single
 
 HEADER = b"\xff\xff"
 BROADCAST_ID = 0xFE
@@ -21,7 +23,7 @@ MAX_PARAMETERS = 253
 
 
 class Instruction(IntEnum):
-    """Seed 1.3; SYNC_READ from the vendor's later manuals, for models that have it."""
+    """SMS 1.0, 1.3 and 1.4; SYNC_READ is from FEETECH's later manuals, for models that have it."""
 
     PING = 0x01
     READ = 0x02
@@ -34,13 +36,13 @@ class Instruction(IntEnum):
 
 
 WRITES = frozenset({Instruction.WRITE, Instruction.REG_WRITE, Instruction.ACTION, Instruction.RESET})
-"""Answered only at response level 1 (feetech.md, section 4)."""
+"""A servo answers these only at response level 1 (FEETECH memory table, address 8)."""
 ANSWERED_BROADCASTS = frozenset({Instruction.PING, Instruction.SYNC_READ})
-"""A broadcast answers nothing, except these (seed 1.1)."""
+"""No servo answers a broadcast, except these (SMS 1.0, 1.1)."""
 
 
 class Packet(NamedTuple):
-    """One packet, either way."""
+    """One packet in either direction."""
 
     id: int
     code: int
@@ -57,17 +59,17 @@ class Packet(NamedTuple):
 
     @property
     def key(self) -> int:
-        """Replies of one servo differ in nothing but their number of parameters."""
+        """Replies of one servo differ only in their number of parameters."""
         return len(self.params)
 
 
 def checksum(body: bytes) -> int:
-    """Of everything between header and checksum: the inverted low byte of the sum."""
+    """Return the inverted low byte of the sum of all bytes between header and checksum."""
     return ~sum(body) & 0xFF
 
 
 def encode(servo_id: int, code: int, params: bytes = b"") -> bytes:
-    """The packet's bytes. Raises ValueError for an id or a length the frame cannot carry."""
+    """Return the bytes of a packet. Raises ValueError for an id or a length that a packet cannot carry."""
     if not 0 <= servo_id <= BROADCAST_ID:
         raise ValueError(f"id {servo_id} is outside 0 to {MAX_ID} (or {BROADCAST_ID} for all)")
     if len(params) > MAX_PARAMETERS:
@@ -76,95 +78,66 @@ def encode(servo_id: int, code: int, params: bytes = b"") -> bytes:
     return HEADER + body + bytes((checksum(body),))
 
 
-class SmsCodec:
-    """Finds packets in a stream. Memory is bounded: no more than one undecided packet (259 bytes) is kept between two calls."""
+class SmsCodec(StreamCodec[Packet]):
+    """Finds packets in a stream of bytes. It keeps at most one undecided packet (259 bytes) between two calls."""
 
-    __slots__ = ("_buffer", "skipped")
-
-    def __init__(self) -> None:
-        self._buffer = b""
-        self.skipped = 0
-
-    @property
-    def pending(self) -> int:
-        return len(self._buffer)
-
-    def receive_data(self, data: bytes) -> None:
-        self._buffer = self._buffer + data if self._buffer else bytes(data)
-
-    def reset(self) -> None:
-        self._buffer = b""
+    __slots__ = ()
 
     def next_reply(self) -> Packet | None:
-        """The next packet with a right checksum; what cannot begin one is skipped and counted."""
-        buffer = self._buffer
-        if not buffer:
-            return None
-        if self._is_one_packet(buffer):
-            self._buffer = b""
-            return Packet(buffer[2], buffer[4], buffer[5:-1], buffer)
-        start = 0
-        while True:
-            found = buffer.find(HEADER, start)
-            if found < 0:
-                # A last FF may be half a header.
-                keep = 1 if buffer.endswith(b"\xff") and len(buffer) > start else 0
-                self._drop(len(buffer) - keep)
-                return None
-            if len(buffer) < found + 4:
-                self._drop(found)
-                return None
-            servo_id, length = buffer[found + 2], buffer[found + 3]
-            if servo_id > BROADCAST_ID or length < 2:
-                start = found + 1
-                continue
-            end = found + 4 + length
-            if len(buffer) < end:
-                self._drop(found)
-                return None
-            if ~sum(buffer[found + 2 : end - 1]) & 0xFF != buffer[end - 1]:
-                start = found + 1
-                continue
-            self.skipped += found
-            self._buffer = buffer[end:]
-            return Packet(servo_id, buffer[found + 4], buffer[found + 5 : end - 1], buffer[found:end])
-
-    @staticmethod
-    def _is_one_packet(data: bytes) -> bool:
-        """What is heard nearly always: one whole packet, and nothing else."""
+        """Return the next packet with a right checksum; bytes that cannot begin one are skipped and counted."""
+        data = self.buffer
         size = len(data)
-        return (
+        # Nearly always exactly one whole packet was received.
+        if (
             size >= OVERHEAD
             and data[3] == size - 4
             and data[:2] == HEADER
             and data[2] <= BROADCAST_ID
             and ~sum(data[2:-1]) & 0xFF == data[-1]
-        )
+        ):
+            self.buffer = b""
+            return Packet(data[2], data[4], data[5:-1], data)
+        return self._search() if data else None
+
+    def _search(self) -> Packet | None:
+        data, at = self.buffer, 0
+        while (start := data.find(HEADER, at)) >= 0:
+            if len(data) < start + 4:
+                self.skip(start)
+                return None
+            servo_id, length = data[start + 2], data[start + 3]
+            end = start + 4 + length
+            at = start + 1
+            if servo_id > BROADCAST_ID or length < 2:
+                continue
+            if len(data) < end:
+                self.skip(start)
+                return None
+            if checksum(data[start + 2 : end - 1]) == data[end - 1]:
+                frame = self.cut(start, end)
+                return Packet(servo_id, frame[4], frame[5:-1], frame)
+        self.skip_to_header(HEADER, at)
+        return None
 
     def describe(self, frame: bytes, *, sent: bool) -> str:
+        """Return one line of text for a frame."""
         return describe(frame, sent=sent)
-
-    def _drop(self, count: int) -> None:
-        self.skipped += count
-        self._buffer = self._buffer[count:]
 
 
 def rename(frame: bytes, rng: Random) -> bytes:
-    """The same packet in the name of another servo."""
+    """Return the same packet with the id of another servo."""
     return encode((frame[2] + rng.randint(1, MAX_ID)) % (MAX_ID + 1), frame[4], frame[5:-1])
 
 
 def node_of(frame: bytes) -> int:
-    """The id of a whole packet."""
+    """Return the id of a whole packet."""
     return frame[len(HEADER)]
 
 
 def describe(frame: bytes, *, sent: bool) -> str:
-    """A packet in words: what `decode` and `--trace` print."""
-    codec = SmsCodec()
-    codec.receive_data(frame)
-    packet = codec.next_reply()
-    if packet is None or packet.frame != frame:
+    """Return the line that `decode` and `--trace` print for a packet."""
+    packet = decode_single(SmsCodec(), frame)
+    if packet is None:
         return f"no SMS packet: {frame.hex(' ')}"
     who = "all" if packet.id == BROADCAST_ID else f"id {packet.id}"
     if not sent:

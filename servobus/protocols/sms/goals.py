@@ -1,20 +1,25 @@
-"""How goals reach FEETECH servos (DESIGN section 3): one WRITE, one SYNC WRITE, or REG WRITE each and one ACTION.
+"""How goals reach FEETECH servos: one WRITE, one SYNC WRITE, or one REG WRITE each and one ACTION.
 
-REG WRITE needs care (seed 1.3.4, 1.3.5): a servo whose acknowledgement is missing may be armed all the same, and a later ACTION
-would move it. Such nodes stand in `maybe_armed` until they are overwritten or their flag was read.
+The rule of REG WRITE and ACTION (SMS 1.0, 1.3.4 and 1.3.5). A servo whose acknowledgement is missing may be armed all the same,
+and a later ACTION would move it. So every servo that is sent a REG WRITE is in `maybe_armed` until one of these is known:
+1. ACTION was sent for it;
+2. its flag register was read as 0;
+3. a harmless REG WRITE has replaced the goal, and an ACTION of its own was acknowledged.
+ACTION to all is withheld while any other servo may be armed. The plan may be closed at any frame, because a servo enters
+`maybe_armed` before its first frame leaves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-from servobus.errors import ActionWithheld, NotSupported, ReplyTimeout, ServobusError
-from servobus.protocols.base import GoalPlan, Plan, ask
-from servobus.protocols.sms.codec import OVERHEAD
+from servobus.errors import ActionWithheld, NotSupported, ReplyTimeout, ServobusError, UnknownName
+from servobus.protocols.base import GoalPlan, Plan, Request, ask
 from servobus.protocols.sms.options import SmsBus
-from servobus.protocols.sms.requests import Action, Read, RegWrite, SyncWrite, Write, sync_write_size
-from servobus.protocols.sms.servo import FittedServo
+from servobus.protocols.sms.packer import GoalPacker, PackedGoal
+from servobus.protocols.sms.requests import Action, RegWrite, SyncWrite, Write, sync_write_size
+from servobus.protocols.sms.servo import HostServo
 from servobus.values import Outcome, ServoGoal
 
 MAX_FRAME_SECONDS = 0.010
@@ -23,83 +28,75 @@ MAX_FRAME_SECONDS = 0.010
 Results = dict[str, Outcome | Exception]
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """One servo's share of a goal frame."""
-
-    servo: FittedServo
-    address: int
-    data: bytes
-    extras: dict[str, int]
-
-    def sent(self) -> None:
-        self.servo.extras.update(self.extras)
-
-
-@dataclass(slots=True)
 class GoalWriter:
-    """Plans the turns of goals. Remembers between turns which nodes may hold a REG WRITE nobody acknowledged."""
+    """Packs goals and plans their turns."""
 
-    options: SmsBus
-    maybe_armed: dict[int, FittedServo] = field(default_factory=dict)
+    def __init__(self, options: SmsBus, servos: Mapping[str, HostServo]) -> None:
+        self.options = options
+        self.packers = {name: GoalPacker(servo) for name, servo in servos.items()}
+        self.maybe_armed: dict[int, HostServo] = {}
+        """Node -> servo that may hold a REG WRITE."""
 
-    def plan(self, goals: Sequence[tuple[FittedServo, ServoGoal]], *, together: bool, confirm: bool) -> list[GoalPlan]:
-        parts = [Part(servo, *servo.goal_span(goal), servo.changed_extras(goal)) for servo, goal in goals]
-        if len(parts) == 1 and (self.acknowledged or not confirm):
-            return [self._turn(parts, self._write(parts[0]))]
+    def check(self, goal: ServoGoal) -> PackedGoal:
+        """Return the packed goal. A duration whose start is not known yet is packed as if the servo were there already."""
+        packer = self.packers.get(goal.servo)
+        if packer is None:
+            raise UnknownName(f"no servo {goal.servo} on this bus")
+        return packer.pack(goal if goal.start is not None else ServoGoal(goal.servo, goal.goal, goal.goal.value))
+
+    def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> list[GoalPlan]:
+        """Return the fewest plans that carry these goals."""
+        parts = [self._packed(goal) for goal in goals]
+        if len(parts) == 1 and (self.options.writes_answered or not confirm):
+            return [GoalPlan((parts[0].servo.name,), self._write_frame(parts))]
         spans = {(part.address, len(part.data)) for part in parts}
         frames = list(self._split(parts))
         if confirm or len(spans) > 1 or (together and len(frames) > 1):
-            if not self.acknowledged:
-                self._require_flags(parts)
-            return [self._turn(parts, self._reg_write_action(parts), len(parts) + 1)]
-        return [self._turn(frame, self._write(frame[0]) if len(frame) == 1 else self._sync_write(frame)) for frame in frames]
+            if not self.options.writes_answered:
+                _require_flags(parts)
+            return [GoalPlan(_names(parts), self._reg_write_action(parts), len(parts) + 1)]
+        return [GoalPlan(_names(frame), self._write_frame(frame)) for frame in frames]
 
-    @property
-    def acknowledged(self) -> bool:
-        """Whether servos answer writes (response level of the memory table)."""
-        return self.options.status_return == "all"
+    def preview(self, goals: Sequence[ServoGoal]) -> list[Request[Any]]:
+        """Return the frames of these goals once the servos hold their settings."""
+        parts = [self.packers[goal.servo].pack(goal, {}) for goal in goals]
+        if len({(part.address, len(part.data)) for part in parts}) > 1:
+            return [*(self._reg_write(part) for part in parts), Action()]
+        return [self._frame(frame) for frame in self._split(parts)]
 
-    def frame_size(self) -> int:
-        """Greatest SYNC WRITE frame: what the servos' buffers are trusted with, and no more than 10 ms of wire."""
-        return min(self.options.sync_max_bytes, int(MAX_FRAME_SECONDS * self.options.baudrate / 10))
+    def _packed(self, goal: ServoGoal) -> PackedGoal:
+        packed = goal.packed
+        return packed if packed is not None and packed.is_for(goal) else self.packers[goal.servo].pack(goal)
 
-    def _split(self, parts: Sequence[Part]) -> Iterator[list[Part]]:
-        each = len(parts[0].data) + 1
-        count = max(1, (self.frame_size() - sync_write_size(0, 0)) // each)
-        for start in range(0, len(parts), count):
-            yield list(parts[start : start + count])
+    def _split(self, parts: Sequence[PackedGoal]) -> Iterator[Sequence[PackedGoal]]:
+        """Parts of one SYNC WRITE each."""
+        if parts:
+            count = max_servos(self.options, len(parts[0].data))
+            for start in range(0, len(parts), count):
+                yield parts[start : start + count]
 
-    @staticmethod
-    def _turn(parts: Sequence[Part], plan: Plan[Results], frames: int = 1) -> GoalPlan:
-        return GoalPlan(tuple(part.servo.name for part in parts), plan, frames)
+    # WRITE and SYNC WRITE
 
-    def _write(self, part: Part) -> Plan[Results]:
-        yield from ask(Write(part.servo.node, part.address, part.data, answered=self.acknowledged))
-        part.sent()
-        return {part.servo.name: Outcome.ACKED if self.acknowledged else Outcome.SENT}
+    def _frame(self, parts: Sequence[PackedGoal]) -> Write | SyncWrite:
+        part = parts[0]
+        if len(parts) == 1:
+            return Write(part.servo.node, part.address, part.data, answered=self.options.writes_answered)
+        return SyncWrite(part.address, {part.servo.node: part.data for part in parts})
 
-    def _sync_write(self, parts: Sequence[Part]) -> Plan[Results]:
-        yield from ask(SyncWrite(parts[0].address, {part.servo.node: part.data for part in parts}))
+    def _write_frame(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
+        request = self._frame(parts)
+        yield request
+        outcome = Outcome.ACKED if request.replies else Outcome.SENT
+        results: Results = {}
         for part in parts:
-            part.sent()
-        return {part.servo.name: Outcome.SENT for part in parts}
+            part.servo.hold(part.settings)
+            results[part.servo.name] = outcome
+        return results
 
     # REG WRITE and ACTION
 
-    def _require_flags(self, parts: Sequence[Part]) -> None:
-        for part in parts:
-            if "async_write_flag" not in part.servo.model.registers:
-                raise NotSupported(
-                    "the servo answers no write and its REG WRITE flag cannot be read, so nothing can be confirmed: "
-                    "set its response level to 1 and status_return to all",
-                    servo=part.servo.name,
-                )
-
-    def _reg_write_action(self, parts: Sequence[Part]) -> Plan[Results]:
-        self.maybe_armed |= {
-            part.servo.node: part.servo for part in parts
-        }  # until each is known not to be: a plan may be cut off at any frame
+    def _reg_write_action(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
+        self.maybe_armed |= {part.servo.node: part.servo for part in parts}
         results: Results = {}
         for part in parts:
             try:
@@ -116,17 +113,20 @@ class GoalWriter:
             return results
         yield from ask(Action())
         for part in armed:
-            part.sent()
+            part.servo.hold(part.settings)
             self.maybe_armed.pop(part.servo.node, None)
         return results
 
-    def _arm(self, part: Part) -> Plan[None]:
-        yield from ask(RegWrite(part.servo.node, part.address, part.data, answered=self.acknowledged))
-        if not self.acknowledged and not (yield from self._flag(part.servo)):
+    def _reg_write(self, part: PackedGoal) -> RegWrite:
+        return RegWrite(part.servo.node, part.address, part.data, answered=self.options.writes_answered)
+
+    def _arm(self, part: PackedGoal) -> Plan[None]:
+        yield from ask(self._reg_write(part))
+        if not self.options.writes_answered and not (yield from _flag(part.servo)):
             raise ReplyTimeout("the servo did not take the REG WRITE: its flag reads 0", servo=part.servo.name)
 
-    def _obstacle(self, parts: Sequence[Part], armed: Sequence[Part]) -> Plan[str]:
-        """Why ACTION must not be sent now; empty: it may."""
+    def _obstacle(self, parts: Sequence[PackedGoal], armed: Sequence[PackedGoal]) -> Plan[str]:
+        """Return why ACTION must not be sent now; empty: it may."""
         if not armed:
             return "no servo acknowledged its REG WRITE"
         silent = [part.servo.name for part in parts if part not in armed]
@@ -137,43 +137,56 @@ class GoalWriter:
             reason = reason or (yield from self._suspicion(self.maybe_armed[node]))
         return reason
 
-    def _suspicion(self, servo: FittedServo) -> Plan[str]:
-        """What is left of it after the servo was asked, and disarmed if need be; empty: nothing."""
+    def _suspicion(self, servo: HostServo) -> Plan[str]:
+        """Ask a servo whether it is armed and disarm it; return why ACTION must still be withheld, or nothing."""
         try:
-            pending = yield from self._flag(servo)
+            pending = yield from _flag(servo)
         except ServobusError:
             pending = 1
         if pending:
             yield from self._disarm(servo)
         else:
             self.maybe_armed.pop(servo.node, None)
-        held = f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
-        return held if servo.node in self.maybe_armed else ""
+        reason = f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
+        return reason if servo.node in self.maybe_armed else ""
 
-    def _flag(self, servo: FittedServo) -> Plan[int]:
-        register = servo.model.register("async_write_flag")
-        return (yield from ask(Read(servo.node, register.address, register.size, _first)))
-
-    def _disarm(self, servo: FittedServo) -> Plan[None]:
-        """Overwrite what waits with something that moves nothing (the sentinel's own value), and let that be carried out."""
-        register = servo.model.registers[servo.model.sentinel.name]
-        harmless = servo.encode(register, servo.extras.get(register.name, servo.model.sentinel.value))
+    def _disarm(self, servo: HostServo) -> Plan[None]:
+        """Replace the waiting goal by a write that moves nothing (the sentinel's own value), and let the servo carry it out."""
+        sentinel = servo.model.sentinel
+        register = servo.model.registers[sentinel.name]
+        harmless = servo.encode(register, servo.held.get(register.name, sentinel.value))
+        answered = self.options.writes_answered
         try:
-            yield from ask(RegWrite(servo.node, register.address, harmless, answered=self.acknowledged))
-            yield from ask(Action(servo.node, answered=self.acknowledged))
+            yield from ask(RegWrite(servo.node, register.address, harmless, answered=answered))
+            yield from ask(Action(servo.node, answered=answered))
         except ServobusError:
-            return  # it stays in maybe_armed, and holds back the next ACTION
+            return  # it remains in maybe_armed, and withholds the next ACTION
         self.maybe_armed.pop(servo.node, None)
 
 
-def split_sync_write(options: SmsBus, address: int, data: dict[int, bytes]) -> Iterator[SyncWrite]:
-    """SYNC WRITE frames of at most the bus's frame size for any number of servos."""
-    size = len(next(iter(data.values()))) + 1
-    count = max(1, (GoalWriter(options).frame_size() - OVERHEAD - 2) // size)
-    nodes = list(data)
-    for start in range(0, len(nodes), count):
-        yield SyncWrite(address, {node: data[node] for node in nodes[start : start + count]})
+def max_frame_size(options: SmsBus) -> int:
+    """Return the bytes of the longest SYNC WRITE: what the servos' buffers can take, and at most 10 ms of wire time."""
+    return min(options.sync_max_bytes, int(MAX_FRAME_SECONDS * options.baudrate / 10))
 
 
-def _first(data: bytes) -> int:
-    return data[0]
+def max_servos(options: SmsBus, size: int) -> int:
+    """Return how many servos one SYNC WRITE carries, with `size` bytes each: at least 1."""
+    return max(1, (max_frame_size(options) - sync_write_size(0, 0)) // (size + 1))
+
+
+def _names(parts: Sequence[PackedGoal]) -> tuple[str, ...]:
+    return tuple([part.servo.name for part in parts])
+
+
+def _require_flags(parts: Sequence[PackedGoal]) -> None:
+    for part in parts:
+        if "async_write_flag" not in part.servo.model.registers:
+            raise NotSupported(
+                "the servo answers no write and its REG WRITE flag cannot be read, so nothing can be confirmed: "
+                "set its response level to 1 and status_return to all",
+                servo=part.servo.name,
+            )
+
+
+def _flag(servo: HostServo) -> Plan[int]:
+    return (yield from ask(servo.read_raw(servo.model.register("async_write_flag"))))

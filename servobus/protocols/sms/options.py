@@ -1,4 +1,4 @@
-"""The YAML keys of a FEETECH bus."""
+"""The YAML keys of a FEETECH bus and of its servos."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from servobus.protocols.options import BusOptions, Name, ServoOptions
 
 class SmsServo(ServoOptions):
     id: Annotated[int, Field(ge=0, le=253)]
-    """0 to 253 (seed 1.1); 254 is everybody."""
+    """0 to 253 (SMS 1.0, 1.1); 254 addresses all servos."""
     model: str = "sms"
-    """sms, sms_cl, sts, scs, or the path of an own model file (*.yaml, relative to the config)."""
+    """sms, sms_cl, sts, scs, or the path of a model file of your own (*.yaml, relative to the config)."""
 
 
 class SmsBus(BusOptions):
@@ -21,8 +21,13 @@ class SmsBus(BusOptions):
     sync_max_bytes: Annotated[int, Field(ge=16, le=259)] = 128
     """Greatest SYNC WRITE frame; the length byte allows 259 bytes, the servos' buffers are not documented."""
     status_return: Literal["all", "read_only"] = "all"
-    """Which instructions are answered (response level of the memory table): with read_only no write is."""
+    """Which instructions the servos answer (response level of the memory table): all, or only PING and READ."""
     on_partial: Literal["abort", "go"] = "abort"
-    """When a REG WRITE stays unacknowledged: withhold ACTION, or send it for those that are armed."""
+    """When a servo does not acknowledge its REG WRITE: withhold ACTION, or send it for the servos that are armed."""
     servos: dict[Name, SmsServo] = {}
     """Empty: a line to scan."""
+
+    @property
+    def writes_answered(self) -> bool:
+        """Whether the servos acknowledge writes."""
+        return self.status_return == "all"

@@ -1,8 +1,8 @@
-"""The instructions of SMS 1.0 (seed 1.3 and 1.4) as requests that know their reply.
+"""The instructions of SMS 1.0 (1.3 and 1.4) as requests that know their reply.
 
-An answer names the servo and nothing else, so `reply_key` is the number of its parameters: replies of one servo with the same key
-can be mistaken for each other. An own request heard back (echo) has the shape of a reply too; `plain()` gives the same question
-in a form whose echo cannot be an answer.
+A reply names only its servo, so `reply_key` is its number of parameters: replies of one servo with the same key can be mistaken
+for each other. The echo of a request has the shape of a reply too; `plain()` returns the same question in a form whose echo
+cannot be a reply.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from servobus.protocols.sms.codec import BROADCAST_ID, OVERHEAD, Instruction, Pa
 R = TypeVar("R")
 
 ID_ADDRESS = 5
-"""The same in every memory table (seed 1.3.3)."""
+"""The same in every FEETECH memory table."""
 
 
 class SmsRequest(Request[R]):
@@ -40,7 +40,7 @@ class SmsRequest(Request[R]):
 
 
 class Ping(SmsRequest[int | None]):
-    """PING (1.3.1): the health byte. To the broadcast id any servo answers, so there must be only one."""
+    """PING (SMS 1.0, 1.3.1): returns the health byte. Any servo answers the broadcast id, so only one may be on the line."""
 
     def __init__(self, node: int) -> None:
         super().__init__(node, Instruction.PING)
@@ -52,7 +52,7 @@ class Ping(SmsRequest[int | None]):
         return replies[0].code
 
     def plain(self) -> Request[int | None]:
-        """The echo of PING is a reply with status 1; a reply with one parameter has no such echo."""
+        """The echo of PING looks like a reply with status 1; a reply with one parameter has no such echo."""
         return PingById(self.node)
 
 
@@ -67,7 +67,7 @@ class PingById(SmsRequest[int | None]):
 
 
 class Read(SmsRequest[R]):
-    """READ DATA (1.3.2) of `size` bytes from `address`; `decode` makes the value of them."""
+    """READ DATA (SMS 1.0, 1.3.2) of `size` bytes from `address`; `decode` turns them into the value."""
 
     __slots__ = ("address", "decode")
 
@@ -80,7 +80,7 @@ class Read(SmsRequest[R]):
         return self.decode(replies[0].params)
 
     def plain(self) -> Request[R] | None:
-        """The echo of a READ has two parameters, so it answers only a READ of two bytes: ask for three."""
+        """The echo of a READ has two parameters, so only a READ of two bytes is in doubt: it asks for three instead."""
         if self.reply_key != 2:
             return None
         decode = self.decode
@@ -90,9 +90,9 @@ class Read(SmsRequest[R]):
 
 
 class Fence(Read[bytes]):
-    """A READ from the id register on: its first byte must be the servo's own id, so it cannot be another register's value."""
+    """A READ that begins at the id register. Its first byte must be the servo's id, which other registers rarely hold."""
 
-    idempotent = False  # said again it would look like the first: the next fence has another length
+    idempotent = False  # a repeated one would look like the first: the next fence has another length
 
     def __init__(self, node: int, size: int) -> None:
         super().__init__(node, ID_ADDRESS, size, bytes)
@@ -102,28 +102,28 @@ class Fence(Read[bytes]):
 
 
 class Acknowledged(SmsRequest[int | None]):
-    """An instruction whose reply, where one is due, has no parameters: the health byte."""
+    """An instruction whose reply, if one is due, has no parameters; its value is the health byte."""
 
     def parse(self, replies: Sequence[Packet]) -> int | None:
         return replies[0].code if replies else None
 
 
 class Write(Acknowledged):
-    """WRITE DATA (1.3.3). At response level 0, and to the broadcast id, nothing answers."""
+    """WRITE DATA (SMS 1.0, 1.3.3). There is no reply at response level 0, nor from the broadcast id."""
 
     def __init__(self, node: int, address: int, data: bytes, *, answered: bool = True) -> None:
         super().__init__(node, Instruction.WRITE, _payload(address, data), answered=answered and node != BROADCAST_ID)
 
 
 class RegWrite(Acknowledged):
-    """REG WRITE (1.3.4): kept by the servo until ACTION."""
+    """REG WRITE (SMS 1.0, 1.3.4): the servo keeps the write until ACTION."""
 
     def __init__(self, node: int, address: int, data: bytes, *, answered: bool = True) -> None:
         super().__init__(node, Instruction.REG_WRITE, _payload(address, data), answered=answered and node != BROADCAST_ID)
 
 
 class Action(Acknowledged):
-    """ACTION (1.3.5): to all it has no reply, to one servo it has. Never repeated: the first may have been carried out."""
+    """ACTION (SMS 1.0, 1.3.5). One servo answers it, the broadcast id does not. Never repeated: the first may have worked."""
 
     idempotent = False
 
@@ -132,7 +132,7 @@ class Action(Acknowledged):
 
 
 class Reset(Acknowledged):
-    """RESET (1.4.6): factory values. The reply may name id 1 already. Never to all, never repeated."""
+    """RESET (SMS 1.0, 1.4.6) to factory values. The reply may have id 1 already. Never sent to all servos, never repeated."""
 
     idempotent = False
 
@@ -146,7 +146,7 @@ class Reset(Acknowledged):
 
 
 class SyncWrite(Acknowledged):
-    """SYNC WRITE (1.4.5): the same span of several servos in one packet, unanswered."""
+    """SYNC WRITE (SMS 1.0, 1.4.5): the same registers of several servos in one packet. There is no reply."""
 
     def __init__(self, address: int, data: Mapping[int, bytes]) -> None:
         sizes = {len(part) for part in data.values()}
@@ -158,7 +158,7 @@ class SyncWrite(Acknowledged):
 
 
 class SyncRead(SmsRequest[R]):
-    """SYNC READ (feetech.md, section 4): one reply per servo, in the order asked. A missing one spoils no other."""
+    """SYNC READ (FEETECH, newer than SMS 1.0): one reply per servo, in the order asked. A missing reply spoils no other."""
 
     __slots__ = ("decode",)
     partial = True
@@ -177,11 +177,11 @@ class SyncRead(SmsRequest[R]):
 
 
 def sync_write_size(size: int, count: int) -> int:
-    """Bytes of a SYNC WRITE frame that carries `size` bytes for each of `count` servos."""
+    """Return the bytes of a SYNC WRITE frame that carries `size` bytes for each of `count` servos."""
     return OVERHEAD + 2 + (size + 1) * count
 
 
 def _payload(address: int, data: bytes) -> bytes:
     if not data:
-        raise ValueError("a write without data says nothing: give at least one byte")
+        raise ValueError("a write without data has no effect: give at least one byte")
     return bytes((address,)) + data

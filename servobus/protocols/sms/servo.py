@@ -1,23 +1,40 @@
-"""One configured FEETECH servo: its options, its model, its calibration, and the bytes that follow from them."""
+"""The host's half of one configured FEETECH servo: its units, what it reported, and the meaning of its blocks of registers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from itertools import pairwise
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from struct import Struct
 from typing import Any
 
-from servobus.errors import LimitError, NotSupported
+from servobus.errors import LimitError
 from servobus.protocols.model import Register
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
-from servobus.values import GoalKind, ServoGoal, Update, is_number
+from servobus.protocols.sms.requests import Read
+from servobus.values import GoalKind, Update, is_number
 
-BY_CALIBRATION = frozenset({"position", "speed", "acceleration"})
+STRUCT_CODES = {1: "B", 2: "H", 4: "I"}
+"""Bytes of a register -> its code for `struct`; signs are sign and magnitude, so every register is unsigned on the wire."""
+Fields = list[tuple[str, Register]]
+"""Field of State, register that holds it."""
+CALIBRATED_UNITS = frozenset({"position", "speed", "acceleration"})
 """Units of registers that the servo's calibration turns into its own unit."""
 
 
-class FittedServo:
-    """Knows how this servo says what. Holds the little that must be remembered between two frames: mode and what RAM holds."""
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """What a servo reported about its own settings. It is replaced as a whole, never changed."""
+
+    mode: GoalKind = "position"
+    limits: tuple[float, float] | None = None
+    """Its stored limits in its unit; None: it has none, or was not asked yet."""
+    response_level: int | None = None
+    """0: it answers PING and READ only; 1: it answers writes too; None: it was not asked yet."""
+
+
+class HostServo:
+    """Converts between the registers of a servo and its unit, and keeps what is known of the servo itself."""
 
     def __init__(self, name: str, options: SmsServo, model: SmsModel) -> None:
         self.name = name
@@ -25,162 +42,141 @@ class FittedServo:
         self.options = options
         self.model = model
         self.calibration = options.calibration(model)
-        self.mode: GoalKind = "position"
-        self.extras: dict[str, int] = {}
-        """Raw acceleration and torque limit as last written; a name is absent while that is not known."""
         self.position, self.time, self.speed = (model.registers[name] for name in model.goal)
-        self.decode_feedback = self._decoder(*model.feedback)
-        self.decode_state = self._decoder(*model.health)
+        self.fit = Fit()
+        self.held: Mapping[str, int] = {}
+        """Raw acceleration and torque limit as last written; a name is absent while its value is not known. The mapping is
+        replaced when one changes, never changed."""
+        self.decode_feedback = self.block_decoder(*model.feedback)
+        self.decode_state = self.block_decoder(*model.health)
+
+    def learn(self, fit: Fit) -> None:
+        """Keep what the servo reported. An equal fit is not replaced, so goals packed for it remain valid."""
+        if fit != self.fit:
+            self.fit = fit
+
+    def hold(self, settings: Mapping[str, int]) -> None:
+        """Keep what was written to the registers beside the goal."""
+        if settings:
+            self.held = {**self.held, **settings}
 
     # Registers
 
     def encode(self, register: Register, raw: int) -> bytes:
+        """Return the bytes of a raw value. Raises LimitError with the servo's name where the register cannot hold it."""
         try:
             return register.encode(raw, self.model.byte_order)
         except LimitError as error:
             raise error.at(servo=self.name) from None
 
     def decode(self, register: Register, data: bytes) -> int:
+        """Return the raw value in these bytes."""
         return register.decode(data, self.model.byte_order)
 
+    def read_raw(self, register: Register) -> Read[int]:
+        """Return the READ of a register's raw value."""
+        return Read(self.node, register.address, register.size, lambda data: self.decode(register, data))
+
+    def packer(self, registers: list[Register]) -> Callable[..., bytes]:
+        """Return the function that packs one word for each of these registers, which follow one another."""
+        return self._struct(registers[0].address, registers[-1].end, registers).pack
+
+    def word_maker(self, register: Register) -> Callable[[int], int]:
+        """Return the function from a raw value to the register's unsigned word; it raises LimitError outside `raw_range`."""
+        low, high = register.raw_range
+        sign = 0 if register.sign_bit is None else 1 << register.sign_bit
+
+        def word(raw: int) -> int:
+            if not low <= raw <= high:
+                self.encode(register, raw)
+            return raw if raw >= 0 else sign - raw
+
+        return word
+
+    # Units
+
+    def converter(self, register: Register) -> Callable[[int], Any]:
+        """Return the function from a raw value to the physical one, in the servo's unit where the register has such a unit."""
+        scale, calibration = register.scale, self.calibration
+        match register.unit:
+            case "position":
+                return lambda raw: calibration.to_unit(raw * scale)
+            case "speed":
+                return lambda raw: calibration.rate_to_unit(raw * scale)
+            case "acceleration":
+                return lambda raw: raw * scale * calibration.unit_per_step
+            case _:
+                return register.to_physical
+
     def to_physical(self, register: Register, raw: int) -> Any:
-        """In the servo's unit where the register is a position, a speed or an acceleration."""
-        if register.unit == "position":
-            return self.calibration.to_unit(raw * register.scale)
-        if register.unit == "speed":
-            return self.calibration.rate_to_unit(raw * register.scale)
-        if register.unit == "acceleration":
-            return raw * register.scale * self.calibration.unit_per_step
-        return register.to_physical(raw)
+        """Return the physical value of a raw one."""
+        return self.converter(register)(raw)
 
     def to_raw(self, register: Register, value: Any) -> int:
-        """The inverse. Raises LimitError for what is no finite number."""
-        if register.unit in BY_CALIBRATION and not is_number(value):
+        """Return the raw value of a physical one. Raises LimitError for anything but a finite number."""
+        if register.unit in CALIBRATED_UNITS and not is_number(value):
             raise LimitError(f"register {register.name}: {value!r} is not a finite number", servo=self.name)
-        if register.unit == "position":
-            return round(self.calibration.to_raw(value) / register.scale)
-        if register.unit == "speed":
-            return round(self.calibration.rate_to_raw(value) / register.scale)
-        if register.unit == "acceleration":
-            return round(float(value) / self.calibration.unit_per_step / register.scale)
-        return register.to_raw(value)
+        match register.unit:
+            case "position":
+                return round(self.calibration.to_raw(value) / register.scale)
+            case "speed":
+                return round(self.calibration.rate_to_raw(value) / register.scale)
+            case "acceleration":
+                return round(float(value) / self.calibration.unit_per_step / register.scale)
+            case _:
+                return register.to_raw(value)
 
-    def _decoder(self, first: str, last: str) -> Callable[[bytes], Update]:
-        """A function from the bytes of a block to fields of State, with everything looked up beforehand."""
+    # Blocks
+
+    def block_decoder(self, first: str, last: str) -> Callable[[bytes], Update]:
+        """Return the function from the bytes of a block to fields of State. It unpacks the block once."""
         start, size = self.model.block(first, last)
-        steps: list[tuple[str, int, int, Register]] = []
-        for field, name in self.model.state.items():
-            register = self.model.registers[name]
-            if start <= register.address and register.end <= start + size:
-                steps.append((field, register.address - start, register.end - start, register))
+        fields: Fields = [
+            (field, register)
+            for field, register in ((field, self.model.registers[name]) for field, name in self.model.state.items())
+            if start <= register.address and register.end <= start + size
+        ]
+        fields.sort(key=lambda entry: entry[1].address)
+        unpackers = []
+        while fields:
+            # Registers that overlap an earlier one are unpacked once more; the packaged models have none.
+            layer, fields = _split_overlapping(fields)
+            unpack = self._struct(start, start + size, [register for _, register in layer]).unpack
+            unpackers.append((unpack, [(field, self._word_converter(field, register)) for field, register in layer]))
 
         def decode(data: bytes) -> Update:
-            update: Update = {}
-            for field, begin, end, register in steps:
-                value = self.to_physical(register, self.decode(register, data[begin:end]))
-                update[field] = bool(value) if field == "moving" else value
-            return update
+            return {
+                field: convert(word)
+                for unpack, steps in unpackers
+                for (field, convert), word in zip(steps, unpack(data), strict=True)
+            }
 
         return decode
 
-    # Goals
+    def _word_converter(self, field: str, register: Register) -> Callable[[int], Any]:
+        """Return the function from the unsigned word on the wire to the field's value."""
+        if field == "moving":
+            return bool
+        convert = self.converter(register)
+        if register.sign_bit is None:
+            return convert
+        sign = 1 << register.sign_bit
+        return lambda word: convert(-(word & sign - 1) if word & sign else word)
 
-    def goal_span(self, goal: ServoGoal) -> tuple[int, bytes]:
-        """Address and bytes of a goal: position, time and speed, and acceleration before or torque limit behind them where
-        this goal needs another than the servo holds. Raises LimitError, NotSupported."""
-        if goal.goal.kind != self.mode:
-            raise NotSupported(self._wrong_mode(goal.goal.kind), servo=self.name)
-        if self.mode == "velocity":
-            parts = [(self.speed, self.encode(self.speed, self._signed_speed(goal.goal.value)))]
-        else:
-            raw = self.calibration.to_raw(goal.goal.value)
-            time, speed = self._pace(goal)
-            values = zip((self.position, self.time, self.speed), (raw, time, speed), strict=True)
-            parts = [(register, self.encode(register, value)) for register, value in values]
-        for name, value in self.changed_extras(goal).items():
-            parts.append((self.model.registers[name], self.encode(self.model.registers[name], value)))
-        return self._join(parts)
+    def _struct(self, start: int, end: int, registers: list[Register]) -> Struct:
+        """Return the struct of these registers, which are in order and do not overlap; it skips the bytes between them."""
+        layout = ">" if self.model.byte_order == "big" else "<"
+        for register in registers:
+            layout += "x" * (register.address - start) + STRUCT_CODES[register.size]
+            start = register.end
+        return Struct(layout + "x" * (end - start))
 
-    def changed_extras(self, goal: ServoGoal) -> dict[str, int]:
-        """Acceleration and torque limit (raw) that this goal needs and the servo's RAM does not hold."""
-        if self.mode == "velocity" and not (goal.goal.acceleration or goal.goal.effort):
-            return {}  # enable() wrote them, and they do not stand beside the speed
-        wanted = self.extras_for(goal.goal.acceleration, goal.goal.effort)
-        return {name: raw for name, raw in wanted.items() if self.extras.get(name) != raw}
 
-    def extras_for(self, acceleration: float | None, effort: float | None) -> dict[str, int]:
-        """Raw values of the RAM registers that shape a motion, from the goal or else from the config."""
-        wanted: dict[str, int] = {}
-        sentinel = self.model.sentinel
-        acceleration = acceleration or self.options.acceleration
-        if acceleration is not None:
-            register = self._extra("acceleration", "an acceleration")
-            wanted["acceleration"] = max(1, self.to_raw(register, acceleration))
-        elif sentinel.name == "acceleration":
-            wanted["acceleration"] = sentinel.value
-        effort = effort or self.options.torque_limit
-        if effort is not None:
-            wanted["torque_limit"] = self._extra("torque_limit", "a torque limit").to_raw(effort)
-        return wanted
-
-    def rest_time(self) -> int:
-        """The time word when speed rules: 0, or the sentinel where it stands there."""
-        sentinel = self.model.sentinel
-        return sentinel.value if sentinel.name == self.time.name else 0
-
-    def default_speed(self) -> int:
-        """Raw speed when a goal names none: the servo's, else its greatest, else the model's."""
-        wanted = self.options.speed or self.options.max_speed
-        if wanted is None:
-            return round((self.model.default_speed or 1.0) / self.speed.scale)
-        return self._speed(wanted)
-
-    def _pace(self, goal: ServoGoal) -> tuple[int, int]:
-        """Raw time and speed words."""
-        wanted = goal.goal
-        if wanted.duration is not None:
-            if self.model.time_is_ms:
-                return max(1, round(wanted.duration * 1000)), 0
-            if goal.start is None:
-                raise LimitError(
-                    "a duration needs the present position, and it is not known: read the servo first", servo=self.name
-                )
-            speed = abs(wanted.value - goal.start) / wanted.duration
-            if self.options.max_speed is not None:  # it may stand farther away than it was thought to when it was asked for
-                speed = min(speed, self.options.max_speed)
-            return self.rest_time(), self._speed(speed) if speed else self.default_speed()
-        if wanted.speed is not None:
-            return self.rest_time(), self._speed(wanted.speed)
-        return self.rest_time(), self.default_speed()
-
-    def _speed(self, speed: float) -> int:
-        """Raw speed of a way; 0 on the wire is no limit at all, so only `allow_max_speed` lets it through."""
-        if speed == 0:
-            if not self.options.allow_max_speed:
-                raise LimitError("speed 0 means no limit to this servo: give a speed, or set allow_max_speed", servo=self.name)
-            return 0
-        return max(1, abs(round(self.calibration.rate_to_raw(speed) / self.speed.scale)))
-
-    def _signed_speed(self, velocity: float) -> int:
-        return self.to_raw(self.speed, velocity)
-
-    def _extra(self, name: str, what: str) -> Register:
-        register = self.model.registers.get(name)
-        if register is None:
-            raise NotSupported(f"model {self.model.name} has no register for {what}: take it out", servo=self.name)
-        return register
-
-    def _join(self, parts: Iterable[tuple[Register, bytes]]) -> tuple[int, bytes]:
-        ordered = sorted(parts, key=lambda part: part[0].address)
-        for (register, _), (following, _) in pairwise(ordered):
-            if register.end != following.address:
-                raise NotSupported(
-                    f"{register.name} and {following.name} of model {self.model.name} cannot be written in one frame",
-                    servo=self.name,
-                )
-        return ordered[0][0].address, b"".join(data for _, data in ordered)
-
-    def _wrong_mode(self, kind: GoalKind) -> str:
-        if kind not in self.model.kinds:
-            return f"model {self.model.name} takes {', '.join(self.model.kinds)} goals only"
-        return f"the servo is in {self.mode} mode and cannot take a {kind} goal: change its mode registers while it is disabled"
+def _split_overlapping(fields: Fields) -> tuple[Fields, Fields]:
+    """Return the fields whose registers do not overlap (sorted by address), and the others."""
+    separate: Fields = []
+    others: Fields = []
+    for field in fields:
+        overlaps = separate and field[1].address < separate[-1][1].end
+        (others if overlaps else separate).append(field)
+    return separate, others

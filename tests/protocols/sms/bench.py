@@ -9,8 +9,7 @@ from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.sms.codec import Instruction, Packet
 from servobus.protocols.sms.driver import SmsDriver
-from servobus.protocols.sms.model import SmsModel
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import SmsModel, packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.device import SmsDevice, devices
 from servobus.values import Goal, Outcome, ServoGoal

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from servobus.protocols.sms.codec import Instruction, Packet, SmsCodec, encode
-from servobus.protocols.sms.model import SmsModel
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import SmsModel, packaged_models
 from servobus.protocols.sms.simulated.device import SmsDevice
 
 FAMILIES = ("sms", "sms_cl", "sts", "scs")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from servobus.errors import DeviceError, NotSupported, ReplyTimeout
+from servobus.protocols.fence import choose_key
 from servobus.protocols.sms.codec import Instruction
-from servobus.protocols.sms.driver import FENCE_SIZES, fence_size
+from servobus.protocols.sms.driver import FENCE_SIZES
 from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench, meddle
 
@@ -114,10 +115,10 @@ def test_a_lost_answer_to_the_unlock_leaves_nothing_unlocked() -> None:
 
 
 def test_a_fence_has_a_length_that_nothing_under_way_has() -> None:
-    assert fence_size([]) == 3
-    assert fence_size([3, 4, 2, "x"]) == 5
+    assert choose_key(FENCE_SIZES, []) == 3
+    assert choose_key(FENCE_SIZES, [3, 4, 2, "x"]) == 5
     everything = [7, *[size for size in FENCE_SIZES if size != 7]]
-    assert fence_size(everything) == 7, "the one asked longest ago"
+    assert choose_key(FENCE_SIZES, everything) == 7, "the one asked longest ago"
     assert 2 not in FENCE_SIZES, "the echo of a READ has two parameters"
 
 

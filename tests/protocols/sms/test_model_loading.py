@@ -9,7 +9,7 @@ import pytest
 
 from servobus.errors import ConfigError
 from servobus.protocols.model_files import merged
-from servobus.protocols.sms.model_loading import FILES, packaged_models
+from servobus.protocols.sms.model import FILES, packaged_models
 
 
 def test_names_and_files(tmp_path: Path) -> None:
@@ -42,15 +42,15 @@ def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
         ("extends: sts\nregisters: {lock: {minimum: 2}}\n", "registers.lock: found values 2 to 1"),
         ("extends: sts\nregisters: {lock: {default: 256}}\n", "registers.lock: found default 256; it can hold 0 to 255"),
         ("extends: sts\nstate: {positon: lock}\n", ":2:9: state.positon: found 'positon'; expected 'position', 'goal'"),
-        ("extends: sts\nfeedback: [moving, present_position]\n", "moving stands behind present_position"),
+        ("extends: sts\nfeedback: [moving, present_position]\n", "moving comes after present_position"),
         ("extends: sts\ngoal: [goal_position]\n", ":2:7: goal: found 1 here; write 3 or more"),
         ("extends: sts\ngoal: [a, b, c, d]\n", ":2:7: goal: found 4 here; write at most 3"),
-        ("extends: sts\nwheel: {registers: {modus: 1}}\n", "modus is named as a part, but is no register of the map"),
+        ("extends: sts\nwheel: {registers: {modus: 1}}\n", "modus is named as a part, but the map has no such register"),
         ("extends: sts\nstate: 7\n", ":2:8: state: found no keys here; write `{key: value}`"),
         ("extends: [sts]\n", ":1:10: extends: found ['sts']; there are"),
         ("", "found no keys here; there are name, title"),
-        ("extends: sts\ngoal: [goal_position, goal_speed, goal_time]\n", "do not stand one behind the other"),
-        ("extends: sts\ntorque: power\n", "power is named as a part, but is no register of the map"),
+        ("extends: sts\ngoal: [goal_position, goal_speed, goal_time]\n", "do not follow one another"),
+        ("extends: sts\ntorque: power\n", "power is named as a part, but the map has no such register"),
         ("name: x\n", "the key title is missing"),
     ],
 )

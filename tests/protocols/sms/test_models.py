@@ -8,7 +8,7 @@ import pytest
 
 from servobus.errors import LimitError
 from servobus.protocols.model import Register
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 
 Fact = tuple[int, int, int | None, str]
 """Address, bytes, sign bit, memory."""

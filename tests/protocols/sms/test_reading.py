@@ -45,7 +45,7 @@ def test_spans_at_their_edges(span: str) -> None:
 
 @pytest.mark.parametrize("span", ["256:1", "255:2", "0:0", "0:251"])
 def test_spans_beyond(span: str) -> None:
-    with pytest.raises(LimitError, match="is no span of the memory table"):
+    with pytest.raises(LimitError, match="give ADDR:LEN with LEN 1 to 250, inside addresses 0 to 255"):
         Bench().driver.read_register("a", span)
 
 
@@ -146,7 +146,7 @@ def test_a_failed_eeprom_write_is_locked_again() -> None:
         ("id", 5, {"persist": True}, NotSupported, "would no longer find the servo"),
         ("baud_rate", 0, {"persist": True, "raw": True}, NotSupported, "would no longer find"),
         ("response_status_level", 0, {"persist": True}, NotSupported, "would no longer find"),
-        ("return_delay", 1, {"raw": True}, NotSupported, "say persist"),
+        ("return_delay", 1, {"raw": True}, NotSupported, "add persist"),
         ("present_position", 1, {}, NotSupported, "can only be read"),
         ("torque_limit", 100.1, {}, LimitError, "outside 0 to 1000"),
         ("torque_limit", -0.1, {}, LimitError, "outside 0 to 1000"),

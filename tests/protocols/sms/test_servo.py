@@ -11,22 +11,23 @@ from hypothesis import strategies as st
 from servobus.errors import LimitError, NotSupported
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
-from servobus.protocols.sms.servo import FittedServo
+from servobus.protocols.sms.packer import GoalPacker
+from servobus.protocols.sms.servo import Fit, HostServo
 from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.single_servo import FAMILIES, model_of
 
 STEP = 360 / 4096
 
 
-def servo_of(family: str = "sts", model: SmsModel | None = None, **keys: Any) -> FittedServo:
-    servo = FittedServo("a", SmsServo(id=1, model=family, **keys), model or model_of(family))
-    servo.extras.update(servo.extras_for(None, None))  # as enable() leaves it
+def servo_of(family: str = "sts", model: SmsModel | None = None, **keys: Any) -> HostServo:
+    servo = HostServo("a", SmsServo(id=1, model=family, **keys), model or model_of(family))
+    servo.hold(GoalPacker(servo).settings(None, None))  # as enable() leaves it
     return servo
 
 
-def span_of(servo: FittedServo, goal: Goal, start: float | None = None) -> str:
-    address, data = servo.goal_span(ServoGoal("a", goal, start))
-    return f"{address:02x} {data.hex(' ')}"
+def span_of(servo: HostServo, goal: Goal, start: float | None = None) -> str:
+    packed = GoalPacker(servo).pack(ServoGoal("a", goal, start))
+    return f"{packed.address:02x} {packed.data.hex(' ')}"
 
 
 # Units
@@ -157,10 +158,10 @@ def test_an_acceleration_below_one_count_is_one() -> None:
 )
 def test_words_at_the_edge_of_their_registers(goal: Goal, right: bool) -> None:
     if right:
-        assert servo_of().goal_span(ServoGoal("a", goal))
+        assert span_of(servo_of(), goal)
     else:
         with pytest.raises(LimitError, match="is outside"):
-            servo_of().goal_span(ServoGoal("a", goal))
+            span_of(servo_of(), goal)
 
 
 @pytest.mark.parametrize(("duration", "right"), [(9.9994, True), (9.9996, False), (0.0001, True)])
@@ -171,7 +172,7 @@ def test_the_time_word_of_an_scs(duration: float, right: bool) -> None:
         assert int("".join(time), 16) == max(1, round(1000 * duration))
     else:
         with pytest.raises(LimitError, match="goal_time"):
-            servo_of("scs").goal_span(ServoGoal("a", goal))
+            span_of(servo_of("scs"), goal)
 
 
 @pytest.mark.parametrize(
@@ -187,23 +188,23 @@ def test_a_duration_becomes_a_speed(value: float, duration: float, start: float,
 def test_velocities_have_a_sign_and_speeds_have_none(direction: int) -> None:
     servo = servo_of(direction=direction)
     assert span_of(servo, Goal("position", 0, speed=90)).endswith("00 04")
-    servo.mode = "velocity"
+    servo.learn(Fit("velocity"))
     assert span_of(servo, Goal("velocity", 90)) == ("2e 00 04" if direction == 1 else "2e 00 84")
     assert span_of(servo, Goal("velocity", 0)) == "2e 00 00"
 
 
 def test_a_wheel_takes_an_effort_beside_its_speed() -> None:
     servo = servo_of()
-    servo.mode = "velocity"
+    servo.learn(Fit("velocity"))
     assert span_of(servo, Goal("velocity", 90, effort=50)) == "2e 00 04 f4 01"
 
 
 @pytest.mark.parametrize(("mode", "kind"), [("position", "velocity"), ("velocity", "position")])
 def test_a_goal_of_the_other_kind(mode: Any, kind: Any) -> None:
     servo = servo_of()
-    servo.mode = mode
+    servo.learn(Fit(mode))
     with pytest.raises(NotSupported, match=f"is in {mode} mode and cannot take a {kind} goal: change its mode registers"):
-        servo.goal_span(ServoGoal("a", Goal(kind, 0)))
+        span_of(servo, Goal(kind, 0))
 
 
 @pytest.mark.parametrize(
@@ -216,20 +217,21 @@ def test_a_goal_of_the_other_kind(mode: Any, kind: Any) -> None:
 )
 def test_what_a_model_has_no_register_for(family: str, goal: Goal, what: str) -> None:
     with pytest.raises(NotSupported, match=f"model {family} has no register for {what}: take it out"):
-        servo_of(family).goal_span(ServoGoal("a", goal))
+        span_of(servo_of(family), goal)
 
 
 def test_only_what_the_servo_does_not_hold_is_written_beside_a_goal() -> None:
     servo = servo_of()
-    assert servo.changed_extras(ServoGoal("a", Goal("position", 0))) == {}
-    servo.extras["acceleration"] = 7
-    assert servo.changed_extras(ServoGoal("a", Goal("position", 0))) == {"acceleration": 254}
-    servo.extras.clear()
+    packer = GoalPacker(servo)
+    assert packer.missing_settings(Goal("position", 0)) == {}
+    servo.hold({"acceleration": 7})
+    assert packer.missing_settings(Goal("position", 0)) == {"acceleration": 254}
+    servo.held = {}
     assert span_of(servo, Goal("position", 0)) == "29 fe 00 08 00 00 e8 03", "what is not known is written"
 
 
 def test_the_configs_acceleration_and_torque_limit() -> None:
     servo = servo_of(acceleration=1000 * STEP, torque_limit=60)
-    assert servo.extras == {"acceleration": 10, "torque_limit": 600}
+    assert servo.held == {"acceleration": 10, "torque_limit": 600}
     assert span_of(servo, Goal("position", 0)) == "2a 00 08 00 00 e8 03"
     assert span_of(servo, Goal("position", 0, effort=50)) == "2a 00 08 00 00 e8 03 f4 01"

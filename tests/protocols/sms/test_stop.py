@@ -158,3 +158,13 @@ def test_many_are_split_as_goals_are() -> None:
 
 def test_nobody_to_stop() -> None:
     assert stop(Bench(TWO)) == {}
+
+
+def test_a_preview_of_a_stop_is_what_leaves_before_the_first_reply() -> None:
+    bench = Bench()
+    targets = [target("a", position=10.0), target("b", position=-10.0)]
+    frames = [request.frame for request in bench.driver.preview_stop(targets)]
+    bench.enable()
+    stop(bench, *targets)
+    assert frames == [packet.frame for packet in bench.said[:2]]
+    assert [request.node for request in bench.driver.preview_stop([target("a"), target("b")])] == [1, 2], "a question to each"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from servobus.protocols.sms.codec import BROADCAST_ID, Instruction, encode
-from servobus.protocols.sms.model_loading import packaged_models
+from servobus.protocols.sms.model import packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.device import SmsDevice, devices
 from tests.protocols.sms.single_servo import FAMILIES, Master, master_of, model_of, packet_of

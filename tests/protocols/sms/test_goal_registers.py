@@ -1,4 +1,4 @@
-"""What the words of a goal become on the wire."""
+"""Which register values a goal becomes on the wire."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench
 from tests.protocols.sms.single_servo import changed, model_of
 
-# What a goal says
+# Position, time and speed
 
 
 @pytest.mark.parametrize(
-    ("goal", "words"),
+    ("goal", "values"),
     [
         (Goal("position", 0), (2048, 0, 1000)),
         (Goal("position", 0, speed=90), (2048, 0, 1024)),
@@ -23,12 +23,12 @@ from tests.protocols.sms.single_servo import changed, model_of
         (Goal("position", 0, duration=0.5), (2048, 0, 1000)),
     ],
 )
-def test_position_time_and_speed(goal: Goal, words: tuple[int, int, int]) -> None:
+def test_position_time_and_speed(goal: Goal, values: tuple[int, int, int]) -> None:
     bench = Bench()
     bench.enable()
     bench.move({"a": goal})
     data = bench.said[0].params[1:]
-    assert tuple(int.from_bytes(data[at : at + 2], "little") for at in (0, 2, 4)) == words
+    assert tuple(int.from_bytes(data[at : at + 2], "little") for at in (0, 2, 4)) == values
 
 
 def test_an_scs_has_a_time_of_its_own() -> None:
