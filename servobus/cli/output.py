@@ -10,7 +10,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, MutableMapping, Sequence
 from contextlib import suppress
 from typing import Any, TextIO, TypeVar, cast
 
@@ -82,20 +82,32 @@ async def _until_terminated(main: Callable[[], Coroutine[Any, Any, R]], status: 
 
 
 def logs(level: int = logging.WARNING) -> None:
-    """To standard error: for people on a terminal, JSON otherwise."""
-    terminal = sys.stderr.isatty()
-    structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer(colors=not os.environ.get("NO_COLOR"))
-            if terminal
-            else structlog.processors.JSONRenderer(),
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.WriteLoggerFactory(cast("TextIO", SafeStream(sys.stderr))),
-        cache_logger_on_first_use=False,
+    """The `servobus` tree of `logging` goes to standard error: for people on a terminal, JSON otherwise."""
+    renderer: Any = structlog.processors.JSONRenderer()
+    if sys.stderr.isatty():
+        renderer = structlog.dev.ConsoleRenderer(colors=not os.environ.get("NO_COLOR"))
+    handler = logging.StreamHandler(cast("TextIO", SafeStream(sys.stderr)))
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            processors=[
+                _event_and_fields,
+                structlog.processors.add_log_level,
+                structlog.processors.TimeStamper(fmt="iso", utc=True),
+                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+                renderer,
+            ]
+        )
     )
+    logger = logging.getLogger("servobus")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(level)
+
+
+def _event_and_fields(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """What `servobus.rig.logs` put beside the text, as keys of their own."""
+    record = event["_record"]
+    fields = getattr(record, "servobus_fields", {})
+    return {**fields, **event, "event": getattr(record, "servobus_event", event["event"])}
 
 
 def emit(data: Any) -> None:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import anyio
 import click
-import structlog
 
 from servobus.cli.output import Number, logs
 from servobus.cli.output import run as run_loop
 from servobus.config.loader import load_config
 from servobus.daemon.main import serve_rig
 from servobus.errors import ConfigError
+from servobus.rig.logs import EventLogger
 from servobus.rpc.socket_path import socket_path
 from servobus.simulation.serve import serve
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.cli")
 
 
 @click.command()

@@ -13,8 +13,6 @@ from collections.abc import Awaitable
 from types import CoroutineType
 from typing import TYPE_CHECKING, Any, cast
 
-import structlog
-
 from servobus.config.access import Role
 from servobus.daemon.fairness import TokenBucket
 from servobus.daemon.jsonrpc import (
@@ -32,6 +30,7 @@ from servobus.daemon.jsonrpc import (
 )
 from servobus.daemon.methods import VERBS, require
 from servobus.errors import ServobusError
+from servobus.rig.logs import EventLogger
 from servobus.rpc.methods import Hello
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ OVERHEAD = 64
 """Bytes that a line takes besides what it says."""
 LABEL = 64
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.daemon")
 
 
 def printable(name: str) -> str:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection, Hashable, Iterable
 
-import structlog
-
 from servobus.daemon.leases import Leases
 from servobus.rig.events import Event
 from servobus.rig.local import LocalRig
+from servobus.rig.logs import EventLogger
 from servobus.values import EventName
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.daemon")
 STOPPING = "the client that moved it is gone, and it is being stopped: wait a moment"
 
 
@@ -89,7 +88,7 @@ class LeaseWatch:
         self.leases.block(known, STOPPING)
         log.warning("lease_lost", client=label, servos=sorted(servos), reason=reason)
         fields = {"client": label, "servos": sorted(servos), "reason": reason}
-        self._rig.announcer.tell(Event(EventName.LEASE_LOST, self._loop.time(), fields))
+        self._rig.event_source.publish(Event(EventName.LEASE_LOST, self._loop.time(), fields))
         task = asyncio.create_task(self._stop(known))
         self._stopping.add(task)
         task.add_done_callback(self._stopping.discard)

@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import anyio
-import structlog
 
 from servobus.daemon.notify import Notifier
 from servobus.daemon.server import NativeDoor, open_door
@@ -17,17 +16,20 @@ from servobus.daemon.sockets import claim
 from servobus.daemon.watchdog import Pulse, Watchdog
 from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig
+from servobus.rig.logs import EventLogger
 from servobus.rig.opening import open_rig
 
 LOOKS = 3
 """Looks at the buses within the time that the system's watchdog allows."""
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.daemon")
 
 
 async def serve_rig(config: str, path: Path, log_every: float) -> None:
     """Until it is cancelled. The socket is claimed before a port is opened: a second daemon disturbs nobody. Raises ConfigError,
     PortBusy."""
+    reloads = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)  # first: a SIGHUP before READY is done after it
     notifier, listener = Notifier(), claim(path)
     async with (
         open_rig(config, degraded=True) as rig,
@@ -36,8 +38,6 @@ async def serve_rig(config: str, path: Path, log_every: float) -> None:
     ):
         log.info("running", config=config, buses=list(rig.buses), doors=door.addresses, pid=os.getpid())
         notifier.ready(f"{len(rig.buses)} buses, {len(rig.names)} servos")
-        reloads = asyncio.Event()
-        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)
         group.start_soon(_reload, rig, door, notifier, reloads)
         group.start_soon(_log_states, rig, log_every)
         if notifier.watchdog is not None:

@@ -10,8 +10,6 @@ from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-import structlog
-
 from servobus.config.access import Role
 from servobus.daemon.connection import Connection
 from servobus.daemon.fairness import FairShare
@@ -20,13 +18,14 @@ from servobus.daemon.sockets import BACKLOG, Tokens, claim, inode, peer_credenti
 from servobus.daemon.subscriptions import Subscriptions
 from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.rig.local import LocalRig
+from servobus.rig.logs import EventLogger
 
 HANDSHAKE = 5.0
 """Seconds."""
 CLOSING = 1.0
 """Seconds that clients get to leave at the end."""
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.daemon")
 
 
 class NativeDoor:

@@ -25,6 +25,8 @@ MIN_TOKEN = 32
 TRIES, WINDOW = 5, 60.0
 """Wrong tokens of one address in so many seconds; then it waits that long."""
 BACKLOG = 1024
+MAX_PATH = 107
+"""Bytes of a socket's path: sun_path of Linux, less its final zero."""
 
 
 def peer_credentials(sock: socket.socket) -> tuple[int, int, int]:
@@ -34,7 +36,9 @@ def peer_credentials(sock: socket.socket) -> tuple[int, int, int]:
 
 
 def claim(path: Path) -> socket.socket:
-    """Listen there. Raises PortBusy where a daemon does already, ConfigError where the place is not safe."""
+    """Listen there. Raises PortBusy where a daemon does already, ConfigError where the place is not safe or its path too long."""
+    if len(os.fsencode(path)) > MAX_PATH:
+        raise ConfigError(f"{path} has more than {MAX_PATH} bytes, too many for a socket: set SERVOBUS_SOCKET to a shorter path")
     _make_folder(path.parent)
     _remove_stale(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)

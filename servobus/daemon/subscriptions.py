@@ -64,7 +64,7 @@ class Subscriptions:
         """Kept here: a timer of uvloop that is due already does not say when."""
         self._written: dict[str, bytes] = {}
         self._written_at = -1.0
-        self._unlisten = rig.announcer.listen(self._event)
+        self._unlisten = rig.event_source.subscribe(self._event)
 
     def add(self, client: Connection, params: Subscribe) -> int:
         """Raises NotSupported, UnknownName, Overloaded."""

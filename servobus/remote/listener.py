@@ -18,7 +18,7 @@ from servobus.remote.cache import LatestSnapshot, StateCache, received
 from servobus.remote.connection import Connection
 from servobus.remote.leases import ClientLeases
 from servobus.remote.session import DEADLINE, Dial, Session
-from servobus.rig.events import Announcer, Event, Feed
+from servobus.rig.events import Event, EventSource, EventStream
 from servobus.rig.interface import Found, Rig, Snapshot
 from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
 from servobus.values import EventName
@@ -34,14 +34,12 @@ class Listening(Rig):
 
     def __init__(self, place: str, dial: Dial, hello: Callable[[], dict[str, Any]], refresh_hz: float) -> None:
         self._cache = StateCache()
-        self._announcer = Announcer()
+        self._event_source = EventSource()
         self._session = Session(place, dial, hello, self._greeted, self._know, self._changed, self._progressed)
         self._leases = ClientLeases(self._session)
         self._refresh_hz = refresh_hz
         self._clock = asyncio.get_running_loop().time
         self._renaming: asyncio.Task[None] | None = None
-        self._hears_events = False
-        self._subscribing = asyncio.Lock()
         self._scanning: dict[str, Callable[[int, int, Found | None], None]] = {}
         self._watching: set[LatestSnapshot] = set()
         self.greeting: Greeting | None = None
@@ -52,6 +50,7 @@ class Listening(Rig):
     async def start(self) -> None:
         self._session.want({"topic": "state", "hz": self._refresh_hz}, self._seen)
         self._session.want({"topic": "stats", "hz": 1.0}, lambda told: self._cache.counted(told["stats"]))
+        self._session.want({"topic": "events"}, self._happened)
         await self._session.connect()
 
     def _greeted(self, greeting: Greeting) -> None:
@@ -72,9 +71,9 @@ class Listening(Rig):
         if lost is not None:
             for newest in self._watching:
                 newest.put(self._cache.snapshot(self._clock()))
-            self._announcer.tell(Event(EventName.DAEMON_LOST, self._clock(), {"reason": lost.message}))
+            self._event_source.publish(Event(EventName.DAEMON_LOST, self._clock(), {"reason": lost.message}))
         elif was is not None:
-            self._announcer.tell(Event(EventName.DAEMON_BACK, self._clock()))
+            self._event_source.publish(Event(EventName.DAEMON_BACK, self._clock()))
 
     async def leave(self, *, lost: bool) -> None:
         """Give back what is held, unless `lost`; then hang up."""
@@ -151,22 +150,15 @@ class Listening(Rig):
             self._watching.discard(newest)
             self._session.unsubscribe(subscription)
 
-    async def events(self) -> AsyncIterator[Event]:
-        """With `daemon_lost` and `daemon_back`, between which there may have been others. Their time is that of their coming."""
-        feed = Feed()
-        unlisten = self._announcer.listen(feed.put)
-        try:
-            async with self._subscribing:
-                if not self._hears_events:
-                    await self._session.subscribe({"topic": "events"}, self._happened)
-                    self._hears_events = True
-            while True:
-                yield await feed.get()
-        finally:
-            unlisten()
+    def events(self) -> EventStream:
+        """As `Rig.events`, with `daemon_lost` and `daemon_back`: between these two, events may have been lost. An event
+        has the time of its arrival here."""
+        return self._event_source.stream()
 
     def _happened(self, told: dict[str, Any]) -> None:
-        self._announcer.tell(Event(str(told["name"]), self._clock(), dict(told.get("fields", {})), int(told.get("missed", 0))))
+        self._event_source.publish(
+            Event(str(told["name"]), self._clock(), dict(told.get("fields", {})), int(told.get("missed", 0)))
+        )
 
     def _progressed(self, told: dict[str, Any]) -> None:
         progress = self._scanning.get(told["bus"])

@@ -1,72 +1,85 @@
-"""What happens on a rig without being asked for: servos that come and go, faults, stops, leases. Bounded for every listener."""
+"""What happens on a rig without being asked for: servos that come and go, faults, stops, leases. Bounded for every reader."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
+from weakref import WeakSet
 
 BACKLOG = 256
-"""Events that one slow listener may be behind; older ones are lost, and it is told how many."""
+"""Events that one slow reader may be behind. Older ones are dropped, and the reader sees how many."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """`name` says what (`servo_offline`, `estop`, `line_down`, `lease_lost` ...), `fields` where and why."""
+    """Something that happened on a rig.
+
+    Attributes:
+        name: A member of `EventName`; from a daemon of another version it may be a name that is not known here.
+        time: Monotonic seconds.
+        fields: Where it happened and why; which fields there are is said by `EventName`.
+        missed: How many events before this one were dropped, because the reader was slow.
+    """
 
     name: str
-    """An `EventName`; from a daemon of another version it may be one that is not known here."""
     time: float
-    """Monotonic seconds."""
     fields: Mapping[str, Any] = field(default_factory=dict)
     missed: int = 0
-    """Events lost before this one, because the listener was slow."""
 
 
-class Feed:
-    """The events of one listener, in order; the oldest are dropped when it is too slow."""
+class EventStream(AsyncIterator[Event]):
+    """The events of one reader, in order, from the moment the stream was made until `aclose`."""
 
     def __init__(self, backlog: int = BACKLOG) -> None:
-        self._waiting: deque[Event] = deque(maxlen=backlog)
+        self._events: deque[Event] = deque(maxlen=backlog)
         self._missed = 0
-        self._some = asyncio.Event()
+        self._closed = False
+        self._changed = asyncio.Event()
 
     def put(self, event: Event) -> None:
-        self._missed += len(self._waiting) == self._waiting.maxlen
-        self._waiting.append(event)
-        self._some.set()
+        """Add an event; a full stream drops its oldest."""
+        self._missed += len(self._events) == self._events.maxlen
+        self._events.append(event)
+        self._changed.set()
 
-    async def get(self) -> Event:
-        while not self._waiting:
-            self._some.clear()
-            await self._some.wait()
-        event, missed, self._missed = self._waiting.popleft(), self._missed, 0
-        return Event(event.name, event.time, event.fields, event.missed + missed)
+    async def __anext__(self) -> Event:
+        while not self._events:
+            if self._closed:
+                raise StopAsyncIteration
+            self._changed.clear()
+            await self._changed.wait()
+        event, missed, self._missed = self._events.popleft(), self._missed, 0
+        return replace(event, missed=event.missed + missed)
+
+    async def aclose(self) -> None:
+        """End the stream: what is in it may still be read."""
+        self._closed = True
+        self._changed.set()
 
 
-class Announcer:
-    """Hands each event to everyone who listens."""
+class EventSource:
+    """Hands each event to every subscriber and every stream. A stream that nobody refers to any more is forgotten."""
 
     def __init__(self) -> None:
-        self._listeners: set[Callable[[Event], None]] = set()
+        self._subscribers: set[Callable[[Event], None]] = set()
+        self._streams: WeakSet[EventStream] = WeakSet()
 
-    def tell(self, event: Event) -> None:
-        for listener in tuple(self._listeners):
-            listener(event)
+    def publish(self, event: Event) -> None:
+        for subscriber in tuple(self._subscribers):
+            subscriber(event)
+        for stream in tuple(self._streams):
+            stream.put(event)
 
-    def listen(self, listener: Callable[[Event], None]) -> Callable[[], None]:
-        """Returns what ends it."""
-        self._listeners.add(listener)
-        return lambda: self._listeners.discard(listener)
+    def subscribe(self, subscriber: Callable[[Event], None]) -> Callable[[], None]:
+        """Call `subscriber` with each event. Returns the function that ends it."""
+        self._subscribers.add(subscriber)
+        return lambda: self._subscribers.discard(subscriber)
 
-    async def events(self) -> AsyncIterator[Event]:
-        """From now on, until the iteration is left."""
-        feed = Feed()
-        unlisten = self.listen(feed.put)
-        try:
-            while True:
-                yield await feed.get()
-        finally:
-            unlisten()
+    def stream(self) -> EventStream:
+        """A stream of all events from now on."""
+        stream = EventStream()
+        self._streams.add(stream)
+        return stream

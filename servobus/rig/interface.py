@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from servobus.errors import UnknownName
-from servobus.rig.events import Event
+from servobus.rig.events import EventStream
 from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
 
 Snapshot = dict[str, State]
@@ -262,7 +262,7 @@ class Rig(ABC):
         """Counters and latencies of each bus, and the condition of each node."""
 
     @abstractmethod
-    def events(self) -> AsyncIterator[Event]:
+    def events(self) -> EventStream:
         """What happens from now on: servos that come and go, faults, stops. A slow reader loses the oldest and is told."""
 
     @abstractmethod

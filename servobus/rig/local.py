@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-import structlog
 from anyio.abc import TaskGroup
 
 from servobus.bus.scan import scan
@@ -16,8 +15,9 @@ from servobus.bus.service import BusService
 from servobus.config.loader import Config, load_config
 from servobus.errors import Busy, InvalidRequest, NotSupported, UnknownName
 from servobus.protocols.registry import PROTOCOLS
-from servobus.rig.events import Announcer, Event
+from servobus.rig.events import Event, EventSource, EventStream
 from servobus.rig.interface import Found, Reload, Rig, Snapshot
+from servobus.rig.logs import EventLogger
 from servobus.rig.results import outcomes, raise_failures
 from servobus.rig.supervisor import BusSupervisor, Trace
 from servobus.values import Change, EventName, Goal, Identity, Outcome, State, StopReport
@@ -26,7 +26,7 @@ R = TypeVar("R")
 QUIET = {EventName.LINE_UP, EventName.ECHO_PROBED, EventName.ESTOP_CLEARED, EventName.SERVO_ONLINE, EventName.RELOADED}
 """Events that are no reason to look."""
 
-log = structlog.get_logger("servobus")
+log = EventLogger("servobus.rig")
 
 
 class LocalRig(Rig):
@@ -45,7 +45,7 @@ class LocalRig(Rig):
         """The file `reload` reads; None: there is none."""
         self.left: dict[str, StopReport] = {}
         """What became of each servo that was still enabled at the end, by full name; filled when the context has ended."""
-        self.announcer = Announcer()
+        self.event_source = EventSource()
         self._only = only
         self._trace = trace
         self._group = supervisors
@@ -297,7 +297,7 @@ class LocalRig(Rig):
 
     def _event(self, name: str, **fields: Any) -> None:
         (log.info if name in QUIET else log.warning)(name, **fields)
-        self.announcer.tell(Event(name, asyncio.get_running_loop().time(), fields))
+        self.event_source.publish(Event(name, asyncio.get_running_loop().time(), fields))
 
-    def events(self) -> AsyncIterator[Event]:
-        return self.announcer.events()
+    def events(self) -> EventStream:
+        return self.event_source.stream()

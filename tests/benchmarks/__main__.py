@@ -8,8 +8,6 @@ import logging
 import sys
 from collections.abc import Callable
 
-import structlog
-
 from tests.benchmarks import door, goals, kst, start, turns
 from tests.benchmarks.report import Report
 
@@ -33,7 +31,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(BENCHMARKS):
         parser.error(f"no benchmark {', '.join(sorted(unknown))}: there are {', '.join(BENCHMARKS)}")
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    logging.getLogger("servobus").setLevel(logging.ERROR)
     reports = {}
     for name in arguments.names or BENCHMARKS:
         reports[name] = BENCHMARKS[name](arguments.seconds, arguments.rounds)

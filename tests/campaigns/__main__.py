@@ -7,8 +7,6 @@ import logging
 import sys
 from collections.abc import Callable
 
-import structlog
-
 from tests.campaigns import crowd, daemon, dead_servo, faults, slow_hand
 from tests.campaigns.oracle import ORACLES
 
@@ -79,7 +77,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if unknown := set(arguments.campaigns) - set(CAMPAIGNS):
         parser.error(f"no campaign {', '.join(sorted(unknown))}: there are {', '.join(CAMPAIGNS)}")
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    logging.getLogger("servobus").setLevel(logging.ERROR)
     kept = [CAMPAIGNS[name](arguments.count) for name in arguments.campaigns or CAMPAIGNS]
     return 0 if all(kept) else 1
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-import structlog
 
 from tests.cli.processes import LIMP, Terminal
 
@@ -15,7 +15,9 @@ from tests.cli.processes import LIMP, Terminal
 @pytest.fixture(autouse=True)
 def _logging_as_before() -> Iterator[None]:
     yield
-    structlog.reset_defaults()
+    logger = logging.getLogger("servobus")
+    logger.handlers, logger.propagate = [logging.NullHandler()], True
+    logger.setLevel(logging.NOTSET)
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ import pytest
 from servobus.config.access import AccessOptions, DoorOptions, Role, TcpOptions
 from servobus.config.loader import parse_config
 from servobus.daemon.methods import VERBS
-from servobus.daemon.sockets import Tokens, claim, read_token
+from servobus.daemon.sockets import MAX_PATH, Tokens, claim, read_token
 from servobus.errors import AccessDenied, ConfigError, Overloaded, PortBusy
 from servobus.rpc.methods import METHODS, WriteRegister, needed_role
 from tests.daemon.raw_client import Raw, dialled, served
@@ -228,6 +228,15 @@ def test_a_new_place_is_ours_alone(tmp_path: Path) -> None:
     with claim(path):
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o750
         assert stat.S_IMODE(path.stat().st_mode) == 0o660
+
+
+def test_a_socket_path_that_is_too_long(tmp_path: Path) -> None:
+    long = tmp_path / ("s" * (MAX_PATH - len(str(tmp_path))))
+    with pytest.raises(ConfigError, match=rf"more than {MAX_PATH} bytes.*SERVOBUS_SOCKET to a shorter path"):
+        claim(long)
+    longest = long.with_name(long.name[:-1])
+    with claim(longest):
+        assert longest.is_socket()
 
 
 def test_a_second_daemon_is_told_of_the_first(tmp_path: Path) -> None:

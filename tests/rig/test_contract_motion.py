@@ -230,6 +230,22 @@ async def test_events(over: Over, tmp_path: Path) -> None:
 
 @both
 @virtual
+async def test_events_begin_at_the_call(over: Over, tmp_path: Path) -> None:
+    """What happens between `events()` and the first `anext` is not lost."""
+    async with over(config(), tmp_path) as (rig, _):
+        events = rig.events()
+        await rig.stop()
+        await rig.clear()
+        await asyncio.sleep(0.1)
+        async with asyncio.timeout(1):
+            assert [(await anext(events)).name for _ in range(2)] == ["estop", "estop_cleared"]
+        await events.aclose()
+        with pytest.raises(StopAsyncIteration):
+            await anext(events)
+
+
+@both
+@virtual
 async def test_a_line_that_goes_and_comes(over: Over, tmp_path: Path) -> None:
     async with over(config(poll="{feedback: 50}"), tmp_path) as (rig, home):
         link = home.supervisors["arm"].link

@@ -155,4 +155,4 @@ async def test_it_is_an_event(path: Path) -> None:
         await asyncio.sleep(0)
         await rig.reload()
         assert (await told).name == "reloaded"
-        await events.aclose()  # type: ignore[attr-defined]
+        await events.aclose()
