@@ -84,7 +84,7 @@ async def test_what_an_arm_carries_is_kept_to(generation: int, longest: int) -> 
         hand._memory.update({1185 + at: 100 + at for at in range(100) if 1185 + at in hand._memory})
         values = await rig.read_register("index", f"1185:{longest}")
         assert values == [100 + at for at in range(longest)]
-        with pytest.raises(ServobusError, match=f"LEN up to {longest}"):
+        with pytest.raises(ServobusError, match=f"LEN 1 to {longest}"):
             await rig.read_register("index", f"1185:{longest + 1}")
 
 

@@ -12,6 +12,8 @@ from enum import IntEnum
 from random import Random
 from typing import Literal, NamedTuple
 
+from servobus.protocols.stream import StreamCodec, decode_single
+
 BROADCAST = 0
 MAX_UNIT = 247
 MAX_READ = 125
@@ -163,54 +165,38 @@ def _multiple_size(buffer: bytes, at: int) -> Sequence[int]:
 SIZES: dict[str, Callable[[bytes, int], Sizes]] = {"master": reply_sizes, "device": request_sizes}
 
 
-class ModbusCodec:
+class ModbusCodec(StreamCodec[Frame]):
     """Finds frames in a stream. Its memory is bounded: it keeps fewer bytes than the frame that they may begin."""
 
-    __slots__ = ("_buffer", "_sizes", "skipped")
+    __slots__ = ("_sizes",)
 
     def __init__(self, end: Literal["master", "device"] = "master") -> None:
         """`end`: which end of the line; a master receives replies, a device requests."""
-        self._buffer = b""
+        super().__init__()
         self._sizes = SIZES[end]
-        self.skipped = 0
-
-    @property
-    def pending(self) -> int:
-        return len(self._buffer)
-
-    def receive_data(self, data: bytes) -> None:
-        self._buffer = self._buffer + data if self._buffer else bytes(data)
-
-    def reset(self) -> None:
-        self._buffer = b""
 
     def next_reply(self) -> Frame | None:
         """Return the next frame with a right CRC; skips and counts bytes that cannot begin one."""
-        buffer = self._buffer
+        buffer = self.buffer
         for at in range(len(buffer)):
             sizes = self._sizes(buffer, at)
             if sizes is None:
-                self._drop(at)
+                self.skip(at)
                 return None
             for size in sizes:
                 end = at + size
                 if end > len(buffer):
                     # It may become complete. A shorter interpretation must not be accepted before.
-                    self._drop(at)
+                    self.skip(at)
                     return None
                 if _crc_fits(buffer, at, end):
-                    self._drop(at)
-                    self._buffer = buffer[end:]
-                    return Frame(buffer[at], buffer[at + 1], buffer[at + 2 : end - CRC_SIZE], buffer[at:end])
-        self._drop(len(buffer))
+                    frame = self.cut(at, end)
+                    return Frame(frame[0], frame[1], frame[2:-CRC_SIZE], frame)
+        self.skip(len(buffer))
         return None
 
     def describe(self, frame: bytes, *, sent: bool) -> str:
         return describe(frame, sent=sent)
-
-    def _drop(self, count: int) -> None:
-        self.skipped += count
-        self._buffer = self._buffer[count:]
 
 
 def _crc_fits(buffer: bytes, at: int, end: int) -> bool:
@@ -230,10 +216,8 @@ def node_of(frame: bytes) -> int:
 
 def describe(frame: bytes, *, sent: bool) -> str:
     """Return one line about a frame, for `decode` and `--trace`."""
-    codec = ModbusCodec("device" if sent else "master")
-    codec.receive_data(frame)
-    reply = codec.next_reply()
-    if reply is None or reply.frame != frame:
+    reply = decode_single(ModbusCodec("device" if sent else "master"), frame)
+    if reply is None:
         return f"not a Modbus-RTU frame: {frame.hex(' ')}"
     who = "all" if reply.unit == BROADCAST else f"unit {reply.unit}"
     function = reply.function & ~REFUSED

@@ -1,4 +1,4 @@
-"""OHand ROH hands: holding registers by Modbus-RTU (the seed), on a line of their own or behind a RealMan arm."""
+"""OHand ROH hands: holding registers by Modbus-RTU (ROH Modbus), on a line of their own or behind a RealMan arm."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from servobus.protocols.roh.simulated.device import devices
 
 
 def codec(options: RohBus | None) -> ModbusCodec:
-    """For the master; the language knows no variants."""
+    """Return a codec for the master's end; Modbus-RTU has no variants."""
     return ModbusCodec("master")
 
 
@@ -21,7 +21,7 @@ def device_codec(options: RohBus | None) -> ModbusCodec:
 
 
 def fingers(unit: int, model: str) -> dict[str, dict[str, Any]]:
-    """A hand is six servos; which map it has is found out again."""
+    """Return the six servos of a hand. Its map is asked for again, so it is not written into the config."""
     return {f"{channel}_{unit}": {"id": unit, "channel": channel} for channel in CHANNELS}
 
 
@@ -34,7 +34,7 @@ DEFINITION = ProtocolDefinition(
     devices=devices,
     rename=rename,
     node_of=node_of,
-    # All hands ship with the first; those of the second generation find the line's rate by themselves, within these.
+    # All hands are shipped with the first; those of the second generation detect the line's rate, within these.
     baudrates=(115_200, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600),
     scan_ids=range(1, MAX_UNIT + 1),
     starter=fingers,

@@ -1,45 +1,44 @@
-"""The ROH driver: what to say to hands and their fingers for each verb (seed 3 and 4). Sans-IO. Never seen on hardware.
+"""The ROH driver: which requests each verb of hands and fingers takes (ROH Modbus, 3 and 4). Sans-IO. Not tried on hardware yet.
 
-A hand is a node, its fingers are servos. It has no ping, torque or stop command: ping reads a register, enabled is the host's
-gate, and a stop writes where each finger is as its target.
+A hand is a node, and its fingers are servos. A hand has no ping, torque or stop command. So a ping reads a register, `enable`
+writes nothing and only lets goals pass, and a stop writes each finger's present position as its target.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from servobus.errors import DeviceError, LimitError, ServobusError, UnknownName
+from servobus.errors import DeviceError, UnknownName
+from servobus.protocols import fence
 from servobus.protocols.base import Driver, GoalPlan, LineTraits, Plan, Poll, Request, ask
-from servobus.protocols.modbus.codec import MAX_UNIT, Function
+from servobus.protocols.modbus.codec import MAX_UNIT, Function, reply_key
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, PresenceRead, RtuTiming
 from servobus.protocols.roh import goals, stop
-from servobus.protocols.roh.commissioning import Commissioning
+from servobus.protocols.roh.commissioning import RohCommissioning
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import FIRST, Hand, identity
 from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.options import MAPS, RohBus
 from servobus.protocols.roh.registers import NamedWrite, named_write, read_named
 from servobus.protocols.roh.spans import Limits, Span, read_spans
+from servobus.protocols.spans import parse_span
 from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
 
-TOLD = range(1, 10)
-"""Fences of so many registers begin where the map is told; behind them stand registers that can only be written."""
-ELSEWHERE = 1020
+IDENTITY_FENCES = range(1, 10)
+"""Fences of so many registers begin at the first one; behind them are registers that can only be written."""
+OTHER_FENCES = 1020
 """Longer fences begin here: the calibration and what follows can be read in every map."""
-LONGEST_FENCE = 60
-FENCE_TRIES = 2
+MAX_FENCE = 60
 HEALTH = ("status", "current")
-SPAN = re.compile(r"(0[xX][0-9a-fA-F]+|\d+):(\d+)")
 
 
 class RohDriver(Driver):
-    """See `protocols.base.Driver`."""
+    """The driver of a line of hands; see `protocols.base.Driver`."""
 
-    commissioning: Commissioning
+    commissioning: RohCommissioning
 
     def __init__(self, options: RohBus, models: Mapping[str, RohModel]) -> None:
         self.options = options
@@ -48,19 +47,19 @@ class RohDriver(Driver):
         self.fingers = {name: Finger(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: finger.node for name, finger in self.fingers.items()}
         self._models = models
-        self.hands = {unit: self._hand(unit) for unit in dict.fromkeys(self.nodes.values())}
-        self.commissioning = Commissioning(self._hand_of)
-        # Requests are immutable, and the same few are said again and again.
+        self.hands = {unit: self._make_hand(unit) for unit in dict.fromkeys(self.nodes.values())}
+        self.commissioning = RohCommissioning(self._hand_of)
+        # Requests are immutable, so each is made once.
         self._reads: dict[tuple[Hashable, ...], Request[Any]] = {}
 
-    def _hand(self, unit: int) -> Hand:
+    def _make_hand(self, unit: int) -> Hand:
         fingers = [finger for finger in self.fingers.values() if finger.node == unit]
-        hand = Hand(unit, fingers, self.options.map_of(unit), self._models, self.timing, self.limits)
-        hand.single_writes = self.options.single_write == "single"
-        return hand
+        single_writes = self.options.single_write == "single"
+        pinned = self.options.map_of(unit)
+        return Hand(unit, fingers, pinned, self._models, self.timing, self.limits, single_writes=single_writes)
 
     def _hand_of(self, unit: int) -> Hand:
-        return self.hands.get(unit) or self._hand(unit)
+        return self.hands.get(unit) or self._make_hand(unit)
 
     def _of(self, servo: str) -> tuple[Finger, Hand]:
         finger = self.fingers[servo]
@@ -71,16 +70,16 @@ class RohDriver(Driver):
         self._reads.clear()
 
     def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError]:
-        """A device failure has a reason, which the hand keeps in a register (seed 3.4)."""
+        """Ask for the reason of a device failure, which the hand keeps in a register (ROH Modbus, 3.4)."""
         return self._of(servo)[1].explain(error)
 
     def step(self, servo: str) -> float:
         return self.fingers[servo].step
 
-    # Who is there
+    # Addressing
 
     def ping(self, node: int) -> Request[int | None]:
-        """Read the first register; a refusal is an answer too. There is no status byte."""
+        """Return a read of the first register. A refusal is an answer too; there is no status byte."""
         return PresenceRead(self.timing, node, FIRST, 1, _nothing)
 
     def unused(self) -> Request[Any]:
@@ -88,84 +87,92 @@ class RohDriver(Driver):
         return Fence(self.timing, next(free, MAX_UNIT), FIRST, 1, _nothing, refusable=True)
 
     def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
-        """The map is looked at again on the way. A hand whose targets or settings are not what we left there has restarted."""
+        """Read a number of registers that no reply under way can have, then check what the enabled fingers' registers hold.
+
+        A short fence reads the map as well, which shows another hand in its place. A hand whose targets or settings are not what
+        was written there has restarted.
+        """
         hand = self._hand_of(node)
-        used = [key[1][0] // 2 for key in avoid if isinstance(key, tuple) and key[0] == Function.READ_HOLDING]
-        for attempt in range(FENCE_TRIES):
-            fence = self._fence(node, used)
-            try:
-                heard = yield from ask(fence)
-                break
-            except ServobusError:
-                if attempt == FENCE_TRIES - 1:
-                    raise
-                used.append(fence.count)
-        if heard is not None and fence.address == FIRST and hand.doubts(heard):
+        under_way: list[Hashable] = [key for key in avoid if isinstance(key, tuple) and key[0] == Function.READ_HOLDING]
+
+        def attempt(key: Hashable) -> Plan[Sequence[int]]:
+            request = self._fence(node, self._fence_keys().index(key) + 1, refusable=not under_way)
+            under_way.append(key)
+            registers = yield from ask(request)
+            return registers if registers is not None and request.address == FIRST else ()
+
+        registers = yield from fence.fence(attempt, self._fence_keys(), avoid)
+        if registers and hand.is_replaced(registers):
             return not enabled
-        return not enabled or (yield from self._kept(hand, enabled))
+        return not enabled or (yield from self._is_unchanged(hand, enabled))
 
-    def _fence(self, node: int, used: Sequence[int]) -> Fence[Sequence[int]]:
-        count = fence_count(used, self.limits.read)
-        address = FIRST if count in TOLD else ELSEWHERE
-        return Fence(self.timing, node, address, count, list, refusable=not used)
+    def _fence_keys(self) -> list[Hashable]:
+        """Return the reply key of a read of 1, 2, 3 ... registers."""
+        counts = range(1, min(self.limits.read, MAX_FENCE) + 1)
+        return [reply_key(Function.READ_HOLDING, bytes((2 * count,))) for count in counts]
 
-    def _kept(self, hand: Hand, enabled: Collection[str]) -> Plan[bool]:
-        """Whether the enabled fingers' registers still hold what we left there. A device failure is a hand that initialises."""
-        wanted = {finger: (finger.target_name, *finger.settings) for finger in hand.fingers if finger.name in enabled}
-        if not wanted:
+    def _fence(self, node: int, count: int, *, refusable: bool) -> Fence[Sequence[int]]:
+        address = FIRST if count in IDENTITY_FENCES else OTHER_FENCES
+        return Fence(self.timing, node, address, count, list, refusable=refusable)
+
+    def _is_unchanged(self, hand: Hand, enabled: Collection[str]) -> Plan[bool]:
+        """Return whether the registers of the enabled fingers hold what they held. A device failure means that it initialises."""
+        names = {finger: (finger.target_name, *finger.held.settings) for finger in hand.fingers if finger.name in enabled}
+        if not names:
             return True
         try:
-            held = yield from hand.words(wanted)
+            values = yield from hand.read_values(names)
         except DeviceError as error:
             return error.code != DEVICE_FAILURE
-        if all(finger.kept(name, raw) for finger, name, raw in held):
+        if all(value.finger.held.matches(value.name, value.raw) for value in values):
             return True
         hand.forget()
         return False
 
     def inspect(self, node: int) -> Plan[Identity]:
-        heard = yield from ask(self._hand_of(node).probe())
-        return identity(heard, [self._models[name] for name in MAPS])
+        registers = yield from ask(self._hand_of(node).identity_read())
+        return identity(registers, [self._models[name] for name in MAPS])
 
     def identify(self, servo: str) -> Plan[Identity]:
-        """Asks for the map anew."""
+        """Ask the hand for its map again."""
         _, hand = self._of(servo)
-        heard = yield from ask(hand.probe())
-        hand.learn(heard)
-        seen = identity(heard, [self._models[name] for name in MAPS])
-        return replace(seen, notes=(hand.obstacle,) if hand.obstacle else ())
+        registers = yield from ask(hand.identity_read())
+        hand.learn(registers)
+        result = identity(registers, [self._models[name] for name in MAPS])
+        return replace(result, notes=(hand.fit.obstacle,) if hand.fit.obstacle else ())
 
     # Reading
 
     def read_state(self, servo: str) -> Request[dict[str, Update]]:
-        """Place, status and what stands between them, in one question; only the place, where the line does not carry that."""
+        """Return the read of position, status and what lies between; only of the position where the line cannot carry that."""
         finger, hand = self._of(servo)
         model = hand.map
-        known = self._reads.get((servo, model.name))
-        if known is not None:
-            return known
-        place, status = finger.address(model, finger.place_name), finger.address(model, "status")
-        start, end = min(place, status), max(place, status) + 1
-        span = Span(start, end - start) if end - start <= self.limits.read else Span(place, 1)
-        make = hand.trusted(model, lambda words: {servo: finger.decode(model, span, words)})
-        request = self._reads[servo, model.name] = hand.read(span, make)
-        return request
+        key = (servo, model.name)
+        if key not in self._reads:
+            position, status = finger.address(model, finger.position_name), finger.address(model, "status")
+            start, end = min(position, status), max(position, status) + 1
+            span = Span(start, end - start) if end - start <= self.limits.read else Span(position, 1)
+            make = hand.trusted(model, lambda registers: {servo: finger.decode(model, span, registers)})
+            self._reads[key] = hand.read(span, make)
+        return self._reads[key]
 
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
-        """Per hand: its fingers' places for feedback, status and current for health, each in the fewest reads. How many those are
-        hangs on the map, which may be learned later; a poll that a map does not need asks nothing."""
-        found = []
+        """Return the fewest reads for each hand: positions for feedback, status and current for health.
+
+        How many they are depends on the map, which may be learned later. A poll that a map does not need makes no request.
+        """
+        polls = []
         for part, hz in rates.items():
             for unit, hand in self.hands.items():
-                most = max(len(self._poll_spans(part, hand, self._models[name])) for name in MAPS)
-                found += [Poll(part, hz, (unit,), partial(self._poll_request, part, hand, index)) for index in range(most)]
-        return found
+                count = max(len(self._poll_spans(part, hand, self._models[name])) for name in MAPS)
+                polls += [Poll(part, hz, (unit,), partial(self._poll_request, part, hand, index)) for index in range(count)]
+        return polls
 
     def _poll_spans(self, part: str, hand: Hand, model: RohModel) -> list[Span]:
         addresses = {
             finger.address(model, name)
             for finger in hand.fingers
-            for name in ((finger.place_name,) if part == "feedback" else HEALTH)
+            for name in ((finger.position_name,) if part == "feedback" else HEALTH)
         }
         return read_spans(addresses, self.limits.read)
 
@@ -179,24 +186,18 @@ class RohDriver(Driver):
             if index >= len(spans):
                 return None
             span = spans[index]
-            self._reads[key] = hand.read(span, lambda words: hand.updates(model, span, words, hand.fingers))
+            self._reads[key] = hand.read(span, lambda registers: hand.updates(model, span, registers, hand.fingers))
         return self._reads[key]
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
-        """A number or a word for one register, a list for a register of several words, or for ADDR:LEN."""
+        """Return a read of one register, whose value is a number or text; a list for a longer register, and for ADDR:LEN."""
         finger, hand = self._of(servo)
         model = hand.map
         key = (servo, register, raw, model.name)
         if key not in self._reads:
-            match = SPAN.fullmatch(register)
-            span = self._free_span(int(match[1], 0), int(match[2])) if match else None
-            self._reads[key] = hand.read(span, list) if span else read_named(finger, hand, model, register, raw=raw)
+            span = parse_span(register, table_size=0x10000, max_count=self.limits.read, servo=servo)
+            self._reads[key] = hand.read(Span(*span), list) if span else read_named(finger, hand, model, register, raw=raw)
         return self._reads[key]
-
-    def _free_span(self, address: int, count: int) -> Span:
-        if not (1 <= count <= self.limits.read and address + count <= 0x10000):
-            raise LimitError(f"{address}:{count} is no span this line can carry: give ADDR:LEN with LEN up to {self.limits.read}")
-        return Span(address, count)
 
     # Writing
 
@@ -207,26 +208,28 @@ class RohDriver(Driver):
     @staticmethod
     def _write(write: NamedWrite, *, raw: bool) -> Plan[Any]:
         yield from write.hand.explained(write.send())
-        return write.count if raw else write.finger.to_physical(write.register, write.count)
+        return write.raw if raw else write.finger.to_physical(write.register, write.raw)
 
     # Motion
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Opens the host's gate. Writes nothing: a finger holds its target anyhow, and there is no torque command. What the hand
-        holds is learned, so that a later restart shows. Raises DeviceError where the map is not the right one."""
+        """Read the position, and write nothing: there is no torque command, and a finger holds its target anyway.
+
+        What the finger's registers hold is read too, so that a restart can be detected later. Raises DeviceError where nothing
+        may be written to the hand.
+        """
         finger, hand = self._of(servo)
         finger.forget()
         yield from hand.attach()
-        names = [finger.place_name, finger.target_name, "speed"]
+        names = [finger.position_name, finger.target_name, "speed"]
         names += ["current_limit"] if finger.options.torque_limit is not None else []
-        held = yield from hand.explained(hand.words({finger: names}))
-        for _, name, raw in held[1:]:
-            finger.learn(name, raw)
-        finger.enabled = True
-        return finger.calibration.to_unit(held[0][2])
+        position, *held = yield from hand.explained(hand.read_values({finger: names}))
+        for value in held:
+            finger.held.confirm(value.name, value.raw)
+        return finger.calibration.to_unit(position.raw)
 
     def disable(self, servo: str) -> Plan[StopReport]:
-        return stop.disable(self.fingers[servo])
+        return stop.disable()
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
         return stop.stop(self.hands, [(self.fingers[target.servo], target) for target in targets])
@@ -235,35 +238,35 @@ class RohDriver(Driver):
         if goal.servo not in self.fingers:
             raise UnknownName(f"no servo {goal.servo} on this bus")
         finger, hand = self._of(goal.servo)
-        if hand.obstacle:
-            raise DeviceError(hand.obstacle, servo=goal.servo)
+        if hand.fit.obstacle:
+            raise DeviceError(hand.fit.obstacle, servo=goal.servo)
         start = goal if goal.start is not None else replace(goal, start=goal.goal.value)
         finger.target(hand.map, start)
         finger.wanted_settings(hand.map, start)
 
-    def host_speed(self, goal: ServoGoal) -> float | None:
-        """The hand keeps the speed that stands in its register."""
-        return None
-
     def plan_goals(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
-        """Every write is acknowledged with its address and number, asked for or not."""
+        """Return one plan for each hand, or one for all. Every write is acknowledged, with or without `confirm`."""
         parts = goals.by_hand(self.hands, [(self.fingers[goal.servo], goal) for goal in goals_])
-        return goals.turns(parts, together=together)
+        return goals.plan_hands(parts, together=together)
+
+    def preview_goals(self, goals_: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
+        return self._preview(goal.servo for goal in goals_)
+
+    def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
+        return self._preview(target.servo for target in targets)
+
+    def _preview(self, servos: Iterable[str]) -> list[Request[Any]]:
+        """Return the writes of these fingers' targets, by the map that the config names or the newest one."""
+        names = set(servos)
+        fingers = {unit: [finger for finger in hand.fingers if finger.name in names] for unit, hand in self.hands.items()}
+        return [request for unit, some in fingers.items() for request in goals.target_writes(self.hands[unit], some)]
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
-        """Of the finger's own status, and of the host's finding that the map does not fit."""
+        """Return the fault in the finger's status, and `register_map` where nothing may be written to the hand."""
         finger, hand = self._of(servo)
-        mismatch = ("register_map",) if hand.obstacle else ()
+        mismatch = ("register_map",) if hand.fit.obstacle else ()
         return (*finger.faults(hand.map, status), *mismatch)
 
 
-def fence_count(used: Sequence[int], limit: int) -> int:
-    """Registers to read that no answer under way can bring; when all are taken, those asked for longest ago (`used` is oldest
-    first)."""
-    counts = range(1, min(limit, LONGEST_FENCE) + 1)
-    free = (count for count in counts if count not in used)
-    return next(free, None) or next(count for count in used if count in counts)
-
-
-def _nothing(words: Sequence[int]) -> int | None:
+def _nothing(registers: Sequence[int]) -> int | None:
     return None

@@ -1,12 +1,13 @@
-"""One hand on the line: which register map it has, and what it means when it refuses.
+"""One hand on the line: which register map it has, and why it refuses.
 
-The map is asked for when the hand is met (high byte of register 1000), because one number is a speed in one map and a target in
-another. Until it is known, and while it is not the pinned one, nothing is written.
+One number is a speed in one map and a target in another. So the hand is asked for its map (the high byte of register 1000), and
+nothing is written to it before that, nor while its map is not the one that the config pins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 from servobus.errors import DeviceError, ServobusError
@@ -22,9 +23,8 @@ from servobus.values import Identity, Update
 R = TypeVar("R")
 
 FIRST = 1000
-"""Where the registers begin that tell the map."""
-SEEN = 4
-"""Of them, as many as a person wants to know."""
+"""The first register; the map, the versions and the hardware can be told from the first four."""
+IDENTITY_COUNT = 4
 SUB_EXCEPTIONS = {
     1: "it is still initialising: wait, then try again",
     2: "it waits for its calibration: finish that first",
@@ -33,13 +33,36 @@ SUB_EXCEPTIONS = {
     5: "the operation failed",
     6: "saving failed",
 }
-"""Seed 3.4."""
+"""ROH Modbus, 3.4."""
 HARDWARE = {0x1B: "ROH-A001 or A002", 0x20: "ROH-AP001", 0x25: "ROH-LiteS001"}
-"""High byte of the hardware version."""
+"""High byte of the hardware version -> product."""
+
+
+@dataclass(frozen=True, slots=True)
+class HandFit:
+    """What a hand reported of itself, and whether that fits the config. Replaced as a whole."""
+
+    model: RohModel | None = None
+    """Its register map; None: not known."""
+    obstacle: str = "it was not asked yet for its register map: is it powered, are id and baud rate right?"
+    """Why nothing may be written to it; empty: it may be written."""
+
+
+NOT_ASKED = HandFit()
+REPLACED = HandFit(obstacle="another hand answers in its place: it was not asked yet for its register map")
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterValue:
+    """A register of a finger and its raw value."""
+
+    finger: Finger
+    name: str
+    raw: int
 
 
 class Hand:
-    """One unit. `limits` are the line's, shared with all hands."""
+    """One unit. `limits` are those of the line, shared by all hands."""
 
     def __init__(
         self,
@@ -49,120 +72,113 @@ class Hand:
         models: Mapping[str, RohModel],
         timing: RtuTiming,
         limits: Limits,
+        *,
+        single_writes: bool,
     ) -> None:
+        """`pinned`: the map that the config names, or auto. `single_writes`: write one register with function 0x06."""
         self.unit = unit
         self.fingers = fingers
         self.pinned = pinned
         self.timing = timing
         self.limits = limits
-        self.single_writes = False
-        """0x06 for single registers."""
+        self.fit = NOT_ASKED
+        self._single_writes = single_writes
         self._models = models
-        self.found: RohModel | None = None
-        """The map it says it has."""
-        self.obstacle = "it was not asked yet for its register map: is it powered, are id and baud rate right?"
-        """Why nothing may be written to it; empty: it may."""
 
     @property
     def map(self) -> RohModel:
-        """What to read by. While it is not known: a map to plan with, whose values nobody believes (see `trusted`)."""
-        return self.found or self._models[NEWEST if self.pinned == "auto" else self.pinned]
+        """The map to read by. While it is not known: one to plan with, whose values are refused (see `trusted`)."""
+        return self.fit.model or self._models[NEWEST if self.pinned == "auto" else self.pinned]
 
     # Which map
 
-    def probe(self) -> ReadHolding[Sequence[int]]:
-        return ReadHolding(self.timing, self.unit, FIRST, SEEN, list)
+    def identity_read(self) -> ReadHolding[Sequence[int]]:
+        """Return the read of the registers that tell the map."""
+        return ReadHolding(self.timing, self.unit, FIRST, IDENTITY_COUNT, list)
 
     def attach(self) -> Plan[None]:
-        """Ask for the map where it is not known. Raises DeviceError where nothing may be written."""
-        if self.found is None:
-            heard = yield from ask(self.probe())
-            if heard:
-                self.learn(heard)
-            else:  # a preview: nothing is sent and nothing is heard, so any map will do
-                self.found, self.obstacle = self.map, ""
-        self.require()
+        """Ask for the map if it is not known. Raises DeviceError where nothing may be written."""
+        if self.fit.model is None:
+            self.learn((yield from ask(self.identity_read())))
+        if self.fit.obstacle:
+            raise DeviceError(self.fit.obstacle)
 
-    def learn(self, heard: Sequence[int]) -> None:
-        """What registers 1000 and 1001 bring."""
-        before, self.found = self.found, next((model for model in self._maps() if model.fits(heard)), None)
-        if before is not None and self.found is not before:
+    def learn(self, registers: Sequence[int]) -> None:
+        """Take the first registers of the hand."""
+        before = self.fit.model
+        model = map_of(registers, [self._models[name] for name in MAPS])
+        self.fit = HandFit(model, self._obstacle(model, registers))
+        if before is not None and model is not before:
             self.forget()
-        if self.found is None:
-            first, second = heard[:2]
-            self.obstacle = (
-                f"its registers 1000 and 1001 read 0x{first:04X} and 0x{second:04X}, none of the maps {', '.join(MAPS)}: "
+
+    def _obstacle(self, model: RohModel | None, registers: Sequence[int]) -> str:
+        if model is None:
+            return (
+                f"its registers 1000 and 1001 read {_first_two(registers, ' and ')}, none of the maps {', '.join(MAPS)}: "
                 "nothing is written to it. Is its firmware one for another protocol?"
             )
-        elif self.pinned not in ("auto", self.found.name):
-            self.obstacle = (
-                f"it has the register map {self.found.name}, the config pins {self.pinned}: nothing is written to it. "
-                f"Set units: {{{self.unit}: {{model: {self.found.name}}}}}"
+        if self.pinned not in ("auto", model.name):
+            return (
+                f"it has the register map {model.name}, the config pins {self.pinned}: nothing is written to it. "
+                f"Set units: {{{self.unit}: {{model: {model.name}}}}}"
             )
-        else:
-            self.obstacle = ""
+        return ""
 
-    def doubts(self, heard: Sequence[int]) -> bool:
-        """A fence brought the first registers again: whether it is another hand now. Then it is to be asked anew."""
-        if self.found is None or self.found.fits(heard):
+    def is_replaced(self, registers: Sequence[int]) -> bool:
+        """Return whether the first registers, read again, are those of another hand. Its map has to be asked for again then."""
+        if self.fit.model is None or self.fit.model.fits(registers):
             return False
-        self.found = None
-        self.obstacle = "another hand answers in its place: it was not asked yet for its register map"
+        self.fit = REPLACED
         self.forget()
         return True
 
     def forget(self) -> None:
+        """The hand has restarted, or it is another one: what its registers hold is not known."""
         for finger in self.fingers:
             finger.forget()
-
-    def require(self) -> None:
-        """Raises DeviceError where nothing may be written."""
-        if self.obstacle:
-            raise DeviceError(self.obstacle)
-
-    def _maps(self) -> Iterable[RohModel]:
-        return (self._models[name] for name in MAPS)
 
     # Reading and writing
 
     def read(self, span: Span, make: Callable[[Sequence[int]], R]) -> ReadHolding[R]:
         return ReadHolding(self.timing, self.unit, span.start, span.count, make)
 
-    def write(self, address: int, words: Sequence[int], *, repeat: bool = True) -> Request[None]:
-        if self.single_writes and len(words) == 1:
-            return WriteSingle(self.timing, self.unit, address, words[0], repeat=repeat)
-        return WriteMultiple(self.timing, self.unit, address, words, repeat=repeat)
+    def write(self, address: int, values: Sequence[int], *, repeat: bool = True) -> Request[None]:
+        if self._single_writes and len(values) == 1:
+            return WriteSingle(self.timing, self.unit, address, values[0], repeat=repeat)
+        return WriteMultiple(self.timing, self.unit, address, values, repeat=repeat)
 
     def trusted(self, model: RohModel, make: Callable[[Sequence[int]], R]) -> Callable[[Sequence[int]], R]:
-        """Of an answer to a read by this map, if it turned out to be the right one. Else DeviceError."""
+        """Return `make`, which raises DeviceError if the map of the read turns out not to be the hand's."""
 
-        def trust(words: Sequence[int]) -> R:
-            if self.found is not model:
-                raise DeviceError(self.obstacle or f"it turned out to have the register map {self.map.name}: ask again")
-            return make(words)
+        def make_if_right(registers: Sequence[int]) -> R:
+            if self.fit.model is not model:
+                raise DeviceError(self.fit.obstacle or f"it turned out to have the register map {self.map.name}: ask again")
+            return make(registers)
 
-        return trust
+        return make_if_right
 
-    def updates(self, model: RohModel, span: Span, words: Sequence[int], fingers: Sequence[Finger]) -> dict[str, Update]:
-        """What a poll brings; nothing by a map that is not the hand's."""
-        if self.found is not model:
+    def updates(self, model: RohModel, span: Span, registers: Sequence[int], fingers: Sequence[Finger]) -> dict[str, Update]:
+        """Return what a poll brings; nothing if its map is not the hand's."""
+        if self.fit.model is not model:
             return {}
-        return {finger.name: update for finger in fingers if (update := finger.decode(model, span, words))}
+        return {finger.name: update for finger in fingers if (update := finger.decode(model, span, registers))}
 
-    def words(self, names: Mapping[Finger, Sequence[str]]) -> Plan[list[tuple[Finger, str, int]]]:
-        """Raw values of some registers of some fingers, in the fewest reads."""
+    def read_values(self, names: Mapping[Finger, Sequence[str]]) -> Plan[list[RegisterValue]]:
+        """Read registers of several fingers, in the fewest reads. Raises DeviceError for an incomplete reply."""
         model = self.map
         wanted = [(finger, name, finger.address(model, name)) for finger, some in names.items() for name in some]
-        heard: dict[int, int] = {}
+        values: dict[int, int] = {}
         for span in read_spans((address for _, _, address in wanted), self.limits.read):
-            found = (yield from ask(self.read(span, list))) or [0] * span.count  # a preview hears nothing
-            heard.update(zip(range(span.start, span.end), found, strict=True))
-        return [(finger, name, model.named(name).raw(heard[address])) for finger, name, address in wanted]
+            registers = yield from ask(self.read(span, list))
+            if not registers or len(registers) != span.count:
+                raise DeviceError(f"its reply to a read of {span.count} registers is incomplete: read again")
+            values.update(zip(range(span.start, span.end), registers, strict=True))
+        return [RegisterValue(finger, name, model.named(name).from_word(values[address])) for finger, name, address in wanted]
 
     # Refusals
 
     def explained(self, plan: Plan[R]) -> Plan[R]:
-        """The plan; a device failure, and a gateway's no, is followed by the question why, once (seed 3.4)."""
+        """Run a plan. After a device failure, or a gateway's refusal, ask the hand once for the reason (ROH Modbus, 3.4)."""
         try:
             return (yield from plan)
         except DeviceError as error:
@@ -178,10 +194,10 @@ class Hand:
             return error
         if not code:
             return error
-        meaning = SUB_EXCEPTIONS.get(code, "a sub-exception no document names")
-        certain = "" if error.code == DEVICE_FAILURE else "its last sub-exception: "
+        meaning = SUB_EXCEPTIONS.get(code, "a sub-exception that is not documented")
+        qualifier = "" if error.code == DEVICE_FAILURE else "its last sub-exception: "
         return DeviceError(
-            f"{error.message}; {certain}{meaning} ({code})",
+            f"{error.message}; {qualifier}{meaning} ({code})",
             code=error.code,
             request=error.request,
             raw=error.raw,
@@ -189,12 +205,23 @@ class Hand:
         )
 
 
-def identity(heard: Sequence[int], models: Iterable[RohModel]) -> Identity:
-    """Who it is, of its first registers."""
-    model = next((model for model in models if model.fits(heard)), None)
+def map_of(registers: Sequence[int], models: Iterable[RohModel]) -> RohModel | None:
+    """Return the map that the first registers of a hand tell. None for an unknown one, and for too few registers."""
+    if len(registers) < IDENTITY_COUNT:
+        return None
+    return next((model for model in models if model.fits(registers)), None)
+
+
+def identity(registers: Sequence[int], models: Iterable[RohModel]) -> Identity:
+    """Return who a hand is, from its first registers."""
+    model = map_of(registers, models)
     if model is None:
-        return Identity(product=f"unknown map: registers 1000 and 1001 read 0x{heard[0]:04X}, 0x{heard[1]:04X}")
-    place = model.named("fw_version").address - FIRST
-    firmware, revision, hardware = heard[place], heard[place + 1], heard[place + 2]
+        return Identity(product=f"unknown map: registers 1000 and 1001 read {_first_two(registers, ', ')}")
+    start = model.named("fw_version").address - FIRST
+    firmware, revision, hardware = registers[start : start + 3]
     product = HARDWARE.get(hardware >> 8, f"ROH hardware 0x{hardware:04X}")
     return Identity(model=model.name, product=product, firmware=f"{firmware >> 8}.{firmware & 0xFF}.{revision}", mode="position")
+
+
+def _first_two(registers: Sequence[int], separator: str) -> str:
+    return separator.join(f"0x{register:04X}" for register in registers[:2]) or "nothing"

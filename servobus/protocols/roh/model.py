@@ -1,7 +1,7 @@
-"""What a map of the ROH hand says beyond names and addresses: how many channels a register has, and how a hand tells its map.
+"""The register maps of ROH hands: how many channels a register has, and how a hand tells its map.
 
-All numbers of a hand are words of 16 bits, high byte first. A register of the fingers stands once for each channel, one behind
-the other, so one read or write carries all of them.
+A register is a 16-bit word, high byte first. A register of the fingers exists once for each channel, at consecutive addresses, so
+one read or write carries all of them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ FULL = 0xFFFF
 
 Channel = Literal["thumb_bend", "index", "middle", "ring", "little", "thumb_rotation"]
 CHANNELS: tuple[Channel, ...] = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
-"""Place in this row = number on the timing."""
+"""In the order of their numbers on the wire."""
 
-PARTS = (
+REQUIRED = (
     "fw_version", "sub_exception", "node_id", "status", "current_limit", "current", "speed", "pos_target", "pos", "angle_target",
     "angle",
 )  # fmt: skip
-"""Registers the driver counts on."""
+"""Registers that the driver uses."""
 
 
 class RohRegister(Register):
@@ -36,23 +36,23 @@ class RohRegister(Register):
     signed: bool = False
     """Two's complement."""
     channels: Annotated[int, Field(ge=0, le=10)] = 0
-    """0: of the hand as a whole; else the channels that have it, from the first on."""
-    words: Annotated[int, Field(ge=1)] | list[int] = 1
-    """Words of each value; a list: of each channel."""
+    """How many channels have it, from the first one on; 0: it belongs to the hand as a whole."""
+    length: Annotated[int, Field(ge=1)] | list[int] = 1
+    """Words of each value; a list: of each channel's value."""
     stride: Annotated[int, Field(ge=1)] = 1
     """Words from one channel to the next."""
     version: bool = False
-    """High byte and low byte are told apart: 3.1."""
+    """High byte and low byte are separate numbers: 3.1."""
     guarded: str = ""
-    """Never written by name: the commissioning verb that does it."""
+    """The commissioning verb that writes it; it cannot be written by name."""
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        least, greatest = (-WORD // 2, WORD // 2 - 1) if self.signed else (0, FULL)
-        return (least if self.minimum is None else self.minimum, greatest if self.maximum is None else self.maximum)
+        low, high = (-WORD // 2, WORD // 2 - 1) if self.signed else (0, FULL)
+        return (low if self.minimum is None else self.minimum, high if self.maximum is None else self.maximum)
 
-    def place(self, channel: int) -> int:
-        """Its address. Raises NotSupported for a channel that has none."""
+    def address_of(self, channel: int) -> int:
+        """Return its address for a channel. Raises NotSupported for a channel that does not have it."""
         if not self.channels:
             return self.address
         if channel >= self.channels:
@@ -61,18 +61,19 @@ class RohRegister(Register):
             )
         return self.address + channel * self.stride
 
-    def length(self, channel: int) -> int:
-        """Words of its value."""
-        return self.words if isinstance(self.words, int) else self.words[channel]
+    def length_of(self, channel: int) -> int:
+        """Return the words of its value."""
+        return self.length if isinstance(self.length, int) else self.length[channel]
 
-    def raw(self, word: int) -> int:
+    def from_word(self, word: int) -> int:
+        """Return the raw value in a word on the wire."""
         return word - WORD if self.signed and word >= WORD // 2 else word
 
-    def word(self, raw: int) -> int:
-        """Raises LimitError outside `raw_range`."""
-        least, greatest = self.raw_range
-        if not least <= raw <= greatest:
-            raise LimitError(f"register {self.name}: raw value {raw} is outside {least} to {greatest}")
+    def to_word(self, raw: int) -> int:
+        """Return the word on the wire. Raises LimitError outside `raw_range`."""
+        low, high = self.raw_range
+        if not low <= raw <= high:
+            raise LimitError(f"register {self.name}: raw value {raw} is outside {low} to {high}")
         return raw % WORD
 
     def to_physical(self, raw: int) -> int | float | str:
@@ -82,41 +83,42 @@ class RohRegister(Register):
 class RohModel(ServoModel):
     """One register map."""
 
-    registers: dict[str, RohRegister]  # type: ignore[assignment]  # a dict of subclasses is no dict of the base, and none is put in
+    registers: dict[str, RohRegister]  # type: ignore[assignment]  # a dict of a subclass; nothing of the base class is put in
     signature: Pair[Annotated[int, Field(ge=0, le=255)] | None]
     """High bytes of registers 1000 and 1001 that tell this map; None: any."""
     angles: dict[Channel, Pair[float]]
-    """Degrees of each open and each closed finger. What is outside the hand would silently replace by its own limit."""
+    """Degrees of each finger when open and when closed. The hand silently replaces a target outside by its own limit."""
     moving: list[str]
     """Status names of a finger that moves."""
     faults: list[str]
     """Status names that are faults."""
     default_current: int
-    """Milliampere of 100 % effort: the factory's current limit."""
-    # What the simulated device needs to behave like the real one.
+    """The factory's current limit in mA, which is 100 % effort."""
+    # For the simulated device only.
     reboot_s: float = 1.0
 
     @property
     def goal_ranges(self) -> dict[str, tuple[float, float]]:
-        """Speed is missing, for its steps are other ones in degrees."""
+        """Limits of goals. Speed is missing, because its steps differ between % and degrees."""
         return {"position": (0, FULL), "acceleration": (0.0, 0.0), "torque_limit": (0.0, 100.0)}
 
     @model_validator(mode="after")
-    def _is_whole(self) -> Self:
-        missing = [name for name in PARTS if name not in self.registers]
+    def _is_complete(self) -> Self:
+        missing = [name for name in REQUIRED if name not in self.registers]
         if missing or set(self.angles) != set(CHANNELS) or set(self.units) != {"%", "deg"}:
-            raise ValueError(f"a map has {', '.join(PARTS)}, angles of each channel, and the units % and deg")
+            raise ValueError(f"a map has {', '.join(REQUIRED)}, angles of each channel, and the units % and deg")
         return self
 
     def named(self, name: str) -> RohRegister:
-        """By name or alias. Raises UnknownName and says what there is."""
-        found = self.register(name)
-        assert isinstance(found, RohRegister)
-        return found
+        """Return a register by name or alias. Raises UnknownName, which lists the names."""
+        register = self.register(name)
+        assert isinstance(register, RohRegister)
+        return register
 
-    def fits(self, heard: Sequence[int]) -> bool:
-        """Whether a hand whose registers from 1000 on begin so has this map."""
-        return all(high is None or word >> 8 == high for word, high in zip(heard, self.signature, strict=False))
+    def fits(self, registers: Sequence[int]) -> bool:
+        """Return whether these registers, from 1000 on, can be those of a hand with this map. None of them shows nothing."""
+        matches = (high is None or word >> 8 == high for word, high in zip(registers, self.signature, strict=False))
+        return bool(registers) and all(matches)
 
     def status_name(self, code: Any) -> str:
         return str(self.registers["status"].to_physical(code))

@@ -1,4 +1,4 @@
-"""The register maps of ROH hands, as packaged files."""
+"""The packaged register maps of ROH hands, and the config checks that need them."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from servobus.protocols.roh.options import MAPS, RohBus, RohServo
 
 FILES = ModelFiles(RohModel, Path(__file__).parent / "models")
 NEWEST = MAPS[-1]
-"""Stands for a map that is not known yet where nothing is sent: config checks, timing load, simulated hands."""
+"""The map that is assumed where a hand's map is not known and nothing is sent: config checks, previews, simulated hands."""
 
 
 def packaged_models() -> Mapping[str, RohModel]:
-    """By name."""
+    """Return the maps by name."""
     return FILES.packaged
 
 
 def load_models(options: RohBus, folder: Path) -> Mapping[str, RohModel]:
-    """All maps, for which one a hand has is known only when it is asked; and what config checks measure a finger by. Raises
-    ConfigError for limits in degrees that the finger cannot reach."""
-    found = packaged_models()
+    """Return all maps, because a hand's map is only known when it was asked, and `finger`, which config checks use.
+
+    Raises ConfigError for limits in degrees that the finger cannot reach.
+    """
+    maps = packaged_models()
     for name, servo in options.servos.items():
-        _check_angles(name, servo, found[NEWEST])
-    return {**found, "finger": found[NEWEST]}
+        _check_angles(name, servo, maps[NEWEST])
+    return {**maps, "finger": maps[NEWEST]}
 
 
 def _check_angles(name: str, servo: RohServo, model: RohModel) -> None:
     if servo.unit != "deg":
         return
     calibration = servo.calibration(model)
-    least, greatest = sorted(calibration.to_unit(angle / model.units["deg"]) for angle in model.angles[servo.channel])
+    low, high = sorted(calibration.to_unit(angle / model.units["deg"]) for angle in model.angles[servo.channel])
     for value in (*(servo.limits or ()), servo.park_pose):
-        if value is not None and not least - 1e-9 <= value <= greatest + 1e-9:
-            raise ConfigError(f"servo {name}: {value:g} deg is outside {least:g} to {greatest:g}, what {servo.channel} reaches")
+        if value is not None and not low - 1e-9 <= value <= high + 1e-9:
+            raise ConfigError(f"servo {name}: {value:g} deg is outside {low:g} to {high:g}, the range of {servo.channel}")
 
 
 def channel_number(servo: RohServo) -> int:
-    """Its place in each row of registers."""
+    """Return the finger's number on the wire."""
     return CHANNELS.index(servo.channel)

@@ -1,4 +1,4 @@
-"""The YAML keys of a line of ROH hands. A hand is a unit, its fingers are servos: id is the unit, channel the finger."""
+"""The YAML keys of a line of ROH hands. A hand is a unit and its fingers are servos: id is the unit, channel the finger."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ Unit = Annotated[int, Field(ge=1, le=MAX_UNIT)]
 Map = Literal["legacy", "v1", "v2"]
 MAPS: tuple[Map, ...] = ("legacy", "v1", "v2")
 
-ALWAYS_HOLDS = "a ROH hand has no torque command, so nothing can make a finger limp: it always holds. Use hold"
-USUAL = 64
-"""Registers of one question; the hand's own limit is documented nowhere."""
+ALWAYS_HOLDS = "a ROH hand has no torque command, and its fingers cannot be made limp: they always hold. Use hold"
+DEFAULT_LIMIT = 64
+"""Registers of one request; the hand's own limit is not documented."""
 
 
 class RohServo(ServoOptions):
     """One finger."""
 
     id: Unit
-    """The hand's unit, 1 to 247; the factory's is 2."""
+    """The hand's unit, 1 to 247; a new hand has 2."""
     channel: Channel
     model: Literal["finger"] = "finger"
-    """What map the hand has stands under `units`."""
+    """Always `finger`; the hand's register map is a key of `units`."""
     unit: Literal["%", "deg"] | None = None
-    """%: 0 open to 100 closed; deg: by the angle registers."""
+    """%: 0 is open, 100 is closed (the default). deg: degrees, by the angle registers."""
 
     @property
     def key(self) -> Hashable:
@@ -45,7 +45,7 @@ class RohServo(ServoOptions):
         return kind
 
     @model_validator(mode="after")
-    def _has_no_register_for_it(self) -> Self:
+    def _has_no_acceleration(self) -> Self:
         if self.acceleration is not None:
             raise ValueError("acceleration: a ROH hand has no register for it: take it out")
         return self
@@ -55,7 +55,8 @@ class UnitOptions(Data):
     """One hand."""
 
     model: Literal["auto", "legacy", "v1", "v2"] = "auto"
-    """Its register map. auto: as its first registers say; a pinned one is compared with them, and refused where they differ."""
+    """Its register map. auto: the one that its first registers tell. Another value must agree with them, or nothing is
+    written."""
 
 
 class RohBus(BusOptions):
@@ -64,13 +65,13 @@ class RohBus(BusOptions):
     units: dict[Unit, UnitOptions] = {}
     """Hands whose map is pinned; all others are `auto`."""
     max_read: Annotated[int, Field(ge=1, le=MAX_READ)] | None = None
-    """Registers of one read; 64 if omitted, and never more than the line carries (a RealMan arm of generation 2 or 3: 12)."""
+    """Registers of one read; default 64, and at most what the line carries (a RealMan arm of generation 2 or 3: 12)."""
     max_write: Annotated[int, Field(ge=1, le=MAX_WRITE)] | None = None
-    """Registers of one write; 64 if omitted, and never more than the line carries (such an arm: 10)."""
+    """Registers of one write; default 64, and at most what the line carries (such an arm: 10)."""
     single_write: Literal["multiple", "single"] = "multiple"
-    """How one register is written. single (0x06): its answer looks like an echo, so only for lines that have none."""
+    """How one register is written. single (0x06): its reply looks like an echo, so it is only for lines without one."""
     turnaround_ms: Annotated[float, Field(ge=0, le=10_000)] = 100.0
-    """Silence after a broadcast."""
+    """Silence after a broadcast, in ms."""
     servos: dict[Name, RohServo] = {}
     """Empty: a line to scan."""
 
@@ -88,9 +89,9 @@ class RohBus(BusOptions):
         return self.units[unit].model if unit in self.units else "auto"
 
     def limits(self, traits: LineTraits) -> tuple[int, int]:
-        """Registers of one read and of one write, over such a line."""
-        return _least(self.max_read or USUAL, traits.max_read), _least(self.max_write or USUAL, traits.max_write)
+        """Return the registers of one read and of one write on a line."""
+        return _limit(self.max_read or DEFAULT_LIMIT, traits.max_read), _limit(self.max_write or DEFAULT_LIMIT, traits.max_write)
 
 
-def _least(wanted: int, carried: int | None) -> int:
-    return wanted if carried is None else min(wanted, carried)
+def _limit(count: int, carried: int | None) -> int:
+    return count if carried is None else min(count, carried)

@@ -1,20 +1,21 @@
-"""The fewest reads and writes that carry some registers. Pure arithmetic of addresses.
+"""The fewest reads and writes that carry given registers. Pure arithmetic with addresses.
 
-A read may run over registers nobody asked for, where that costs less than a second turn; a write never does.
+A read may cover registers that are not wanted, if that costs less than a second turn. A write never does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-WORTHWHILE = 26
-"""Words nobody asked for that cost as much as one more turn at 115200 baud: 13 bytes and two silences of 1.75 ms."""
+MAX_UNWANTED = 26
+"""Unwanted registers between two wanted ones that cost as much as another turn at 115200 baud: 13 bytes and two gaps of 1.75
+ms."""
 
 
 @dataclass(slots=True)
 class Limits:
-    """Registers that the line carries in one question; known for sure when it is up."""
+    """Registers of one request; final when the line is open."""
 
     read: int
     write: int
@@ -22,7 +23,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Registers one behind the other."""
+    """Consecutive registers."""
 
     start: int
     count: int
@@ -31,31 +32,26 @@ class Span:
     def end(self) -> int:
         return self.start + self.count
 
-    def holds(self, address: int) -> bool:
+    def contains(self, address: int) -> bool:
         return self.start <= address < self.end
 
 
 def read_spans(addresses: Iterable[int], limit: int) -> list[Span]:
-    """Everything in these addresses, in as few reads as are worth it."""
-    return _joined(addresses, limit, WORTHWHILE)
+    """Return the cheapest reads of all these addresses."""
+    return _joined(addresses, limit, MAX_UNWANTED)
 
 
 def write_spans(addresses: Iterable[int], limit: int) -> list[Span]:
-    """These addresses and no other."""
+    """Return the fewest writes of these addresses and no others."""
     return _joined(addresses, limit, 0)
 
 
-def _joined(addresses: Iterable[int], limit: int, idle: int) -> list[Span]:
+def _joined(addresses: Iterable[int], limit: int, max_unwanted: int) -> list[Span]:
     spans: list[Span] = []
     for address in sorted(set(addresses)):
         last = spans[-1] if spans else None
-        if last and address - last.end <= idle and address + 1 - last.start <= limit:
+        if last and address - last.end <= max_unwanted and address + 1 - last.start <= limit:
             spans[-1] = Span(last.start, address + 1 - last.start)
         else:
             spans.append(Span(address, 1))
     return spans
-
-
-def cut(span: Span, words: Sequence[int], address: int) -> int:
-    """The word at this address."""
-    return words[address - span.start]

@@ -89,7 +89,7 @@ async def test_a_hand_is_met_enabled_moved_and_stopped() -> None:
         await asyncio.sleep(0.5)
         state = bus.state("ring")
         assert (state.position, state.goal, state.enabled, state.moving, state.current) == (40, 40, True, False, 0)
-        hands[0].digits[3].obstacle = 30000
+        hands[0].fingers[3].obstacle = 30000
         await move(bus, ring=100)
         await asyncio.sleep(2)
         assert bus.state("ring").faults == ("stuck",)
@@ -153,7 +153,7 @@ async def test_all_fingers_of_a_hand_that_restarts_are_disabled() -> None:
 @virtual
 async def test_a_map_that_is_not_the_pinned_one_is_said_and_refused() -> None:
     async with running({"a": TWO["a"]}, units={2: {"model": "v1"}}) as (bus, hands, events):
-        hands[0]._put("protocol_version", 0, 0x0200)
+        hands[0].poke("protocol_version", 0, 0x0200)
         identity = await bus.identify("a")
         assert "config pins v1" in identity.notes[0]
         assert "servo_note" in events

@@ -52,7 +52,7 @@ def test_who_answers_at_the_new_unit_must_be_it() -> None:
     next(plan)
     plan.throw(ReplyTimeout("nobody"))
     plan.send(None)
-    with pytest.raises(DeviceError, match="who answers as unit 7 says it is unit 3"):
+    with pytest.raises(DeviceError, match="the hand at unit 7 reports unit 3"):
         plan.send(3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from servobus.errors import DeviceError, ReplyTimeout, UnknownName
 from servobus.protocols.base import Driver
 from servobus.protocols.modbus.codec import pack, reply_key
-from servobus.protocols.roh.driver import LONGEST_FENCE, fence_count
+from servobus.protocols.roh.driver import MAX_FENCE
 from servobus.protocols.roh.model import CHANNELS
 from servobus.values import Identity
 from tests.protocols.roh.bench import Bench, bench_of, goal
@@ -51,7 +52,7 @@ def test_who_is_not_configured_can_be_looked_at() -> None:
     bench = Bench({}, maps={})
     bench.devices = Bench().devices
     assert bench.run(bench.driver.inspect(2)).model == "v2"
-    bench.hand._put("hw_version", 0, 0x7701)
+    bench.hand.poke("hw_version", 0, 0x7701)
     assert bench.run(bench.driver.inspect(2)).product == "ROH hardware 0x7701"
 
 
@@ -77,7 +78,7 @@ def refuses(bench: Bench, why: str) -> None:
 def test_a_hand_that_has_not_the_pinned_map_is_not_written_to(pinned: str, has: str) -> None:
     bench = bench_of(has, units={2: {"model": pinned}})
     refuses(bench, f"register map {has}, the config pins {pinned}")
-    bench.hand.digits[1].position = 13107
+    bench.hand.fingers[1].position = 13107
     assert bench.read("index", "position") == 20, "it is read by the map it has"
 
 
@@ -90,8 +91,8 @@ def test_the_pinned_map_is_fine(name: str) -> None:
 @pytest.mark.parametrize("word", [0x0000, 0x0400, 0x0201, 0xFFFF])
 def test_a_hand_with_no_known_map_is_not_written_to(word: int) -> None:
     bench = Bench()
-    bench.hand._put("protocol_version", 0, word)
-    bench.hand._put("fw_version", 0, 0x0402)
+    bench.hand.poke("protocol_version", 0, word)
+    bench.hand.poke("fw_version", 0, 0x0402)
     refuses(bench, f"0x{word:04X} and 0x0402")
     with pytest.raises(DeviceError, match="none of the maps"):
         bench.read("index", "position")
@@ -145,16 +146,25 @@ def test_the_question_nobody_answers_goes_to_a_free_unit() -> None:
 # Fences
 
 
-def test_a_fence_reads_a_number_of_registers_that_is_not_under_way() -> None:
-    assert fence_count((), 64) == 1
-    assert fence_count((6, 1, 2), 64) == 3
-    assert fence_count(range(1, 12), 12) == 12
-    assert fence_count(range(1, 200), 125) == 1
-    assert fence_count([*range(2, LONGEST_FENCE + 1), 1], 64) == 2
+@pytest.mark.parametrize(
+    ("under_way", "limit", "count"),
+    [
+        ([], 64, 1),
+        ([6, 1, 2], 64, 3),
+        (range(1, 12), 12, 12),
+        (range(1, 126), 125, 1),
+        ([*range(2, MAX_FENCE + 1), 1], 64, 2),
+    ],
+)
+def test_a_fence_reads_a_number_of_registers_that_is_not_under_way(under_way: Sequence[int], limit: int, count: int) -> None:
+    """When all are, the one that was asked for longest ago."""
+    driver = Bench(max_read=limit).driver
+    request = next(driver.fence(2, outstanding(*under_way), ()))
+    assert request.frame[5] == count
 
 
 @MAPS
-@pytest.mark.parametrize("under_way", [[], [1], list(range(1, 10)), list(range(1, LONGEST_FENCE))])
+@pytest.mark.parametrize("under_way", [[], [1], list(range(1, 10)), list(range(1, MAX_FENCE))])
 def test_every_fence_is_answered_by_every_map(name: str, under_way: list[int]) -> None:
     bench = bench_of(name)
     bench.hand.refuses_write_only = True
@@ -191,7 +201,7 @@ def test_a_restart_shows_in_the_targets(name: str) -> None:
     bench.after(5)
     assert bench.run(bench.driver.fence(2, [], ())), "nobody asked"
     assert not bench.run(bench.driver.fence(2, [], bench.driver.nodes))
-    assert not any(finger.enabled for finger in bench.driver.fingers.values())
+    assert not any(finger.held.targets or finger.held.settings for finger in bench.driver.fingers.values())
 
 
 def test_a_restart_shows_in_the_speeds() -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
-from servobus.protocols.base import run_plan
+from servobus.protocols.base import Plan, Request, run_plan
+from servobus.protocols.modbus.codec import Function
+from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.model import CHANNELS
 from servobus.protocols.roh.spans import Span, read_spans, write_spans
 from servobus.values import ServoGoal, StopTarget
@@ -27,7 +31,7 @@ def test_six_fingers_are_one_write() -> None:
     assert bench.move(*goals) == dict.fromkeys(CHANNELS, "acked")
     assert [request.frame.hex(" ") for request in bench.said] == ["02 10 04 6f 00 06 0c" + " 00" * 10 + " ff ff 60 3e"]
     bench.after(2)
-    assert [round(digit.position) for digit in bench.hand.digits] == [0] * 5 + [65535]
+    assert [round(digit.position) for digit in bench.hand.fingers] == [0] * 5 + [65535]
 
 
 def test_only_what_was_asked_for_is_written() -> None:
@@ -95,7 +99,7 @@ def test_a_speed_is_written_before_the_target_and_once() -> None:
     bench.move(goal("index", 100, speed=50), goal("middle", 100, speed=50))
     assert bench.frames() == ["unit 2 WRITE 1126 to 1127 = 32768 32768", "unit 2 WRITE 1136 to 1137 = 65535 65535"]
     bench.after(1)
-    assert round(bench.hand.digits[1].position) == 32768
+    assert round(bench.hand.fingers[1].position) == 32768
     bench.move(goal("index", 0, speed=50))
     assert bench.frames() == ["unit 2 WRITE 1136 = 0"]
     bench.move(goal("index", 0))
@@ -141,7 +145,7 @@ def test_speeds_at_the_edge() -> None:
     for speed, raw in ((100, 65535), (0, 65535), (0.0001, 1)):
         changes = bench.driver.fingers["index"].wanted_settings(bench.driver.hands[2].map, goal("index", 1, speed=speed))
         assert changes == {"speed": raw}
-    with pytest.raises(LimitError, match=r"speed 100.01 %/s is above the hand's greatest, 100"):
+    with pytest.raises(LimitError, match=r"speed 100.01 %/s is above the hand's maximum, 100"):
         bench.driver.check_goal(goal("index", 1, speed=100.01))
     with pytest.raises(LimitError, match="speed 0 means no limit"):
         bench.driver.check_goal(goal("middle", 1, speed=0))
@@ -154,7 +158,7 @@ def test_a_finger_whose_speed_was_refused_does_not_start() -> None:
     assert isinstance(results["index"], DeviceError)
     assert results["ring"] == "acked"
     assert "unit 2 WRITE 1138 = 65535" in bench.frames()
-    assert bench.hand.digits[1].target == 0
+    assert bench.hand.fingers[1].target == 0
 
 
 # What no finger does
@@ -182,7 +186,7 @@ def test_beyond_it(wanted: ServoGoal, error: str) -> None:
     result = bench.move(wanted, goal("ring", 50))
     assert isinstance(result["index"], (LimitError, NotSupported))
     assert result["ring"] == "acked"
-    assert bench.hand.digits[1].target == 0
+    assert bench.hand.fingers[1].target == 0
 
 
 @pytest.mark.parametrize(("value", "fine"), [(100.22, True), (178.37, True), (100.21, False), (178.38, False)])
@@ -192,7 +196,7 @@ def test_angles_the_finger_does_not_reach_are_refused(value: float, fine: bool) 
     if fine:
         bench.driver.check_goal(goal("index", value))
     else:
-        with pytest.raises(LimitError, match=r"outside 100.22 to 178.37, what index reaches"):
+        with pytest.raises(LimitError, match=r"outside 100.22 to 178.37, the range of index"):
             bench.driver.check_goal(goal("index", value))
 
 
@@ -207,7 +211,7 @@ def test_whatever_is_asked_for_stands_in_the_targets_and_nothing_else(wanted: di
 @given(st.sets(st.integers(1000, 1200), max_size=20), st.integers(1, 64))
 def test_spans_hold_everything_and_fit(addresses: set[int], limit: int) -> None:
     for spans in (read_spans(addresses, limit), write_spans(addresses, limit)):
-        assert all(any(span.holds(address) for span in spans) for address in addresses)
+        assert all(any(span.contains(address) for span in spans) for address in addresses)
         assert all(span.count <= limit for span in spans)
         assert all(one.end <= other.start for one, other in pairwise(spans))
     assert sum(span.count for span in write_spans(addresses, limit)) == len(addresses)
@@ -220,14 +224,67 @@ def test_a_read_runs_over_strangers_only_where_that_is_cheaper() -> None:
     assert read_spans([1, 13], 12) == [Span(1, 1), Span(13, 1)]
 
 
-# Preview
+# Previews and missing answers
 
 
-def test_a_preview_needs_no_hand() -> None:
+def test_previews_are_the_writes_and_change_nothing() -> None:
     bench = Bench()
-    said: list[str] = []
-    for turn in bench.driver.plan_goals(all_fingers(50), together=False, confirm=False):
-        run_plan(turn.plan, lambda request: said.append(type(request).__name__))
-    assert said == ["ReadHolding", "WriteMultiple", "WriteMultiple"]
-    reports = run_plan(bench.driver.stop([StopTarget("index", "hold", True, 0.0)]), lambda request: 0)
-    assert reports["index"].written
+    fit = bench.driver.hands[2].fit
+    for preview in (
+        bench.driver.preview_goals(all_fingers(50)),
+        bench.driver.preview_stop([StopTarget(channel, "hold", True, 0.0) for channel in CHANNELS]),
+    ):
+        assert [(request.frame[:7].hex(" "), len(request.frame)) for request in preview] == [("02 10 04 6f 00 06 0c", 21)]
+    some = bench.driver.preview_goals([goal("index", 10), goal("middle", 20), goal("little", 30)])
+    assert [len(request.frame) for request in some] == [13, 11]
+    assert bench.driver.hands[2].fit is fit
+    with pytest.raises(DeviceError, match="not asked yet"):
+        bench.driver.check_goal(goal("index", 50))
+
+
+def verbs(driver: RohDriver) -> dict[str, Plan[Any]]:
+    """Plans that ask a hand for its map, or read what it holds."""
+    (goals,) = driver.plan_goals(all_fingers(50), together=False, confirm=False)
+    return {
+        "identify": driver.identify("index"),
+        "goals": goals.plan,
+        "enable": driver.enable("index"),
+        "write": driver.write_register("index", "beep_period", 0.5),
+        "stop": driver.stop([StopTarget("index", "hold", True, 50.0)]),
+        "command": driver.commissioning.command(2, "zero_force"),
+    }
+
+
+@pytest.mark.parametrize("registers", [[], [0x0200]])
+@pytest.mark.parametrize("verb", ["identify", "goals", "enable", "write", "stop", "command"])
+def test_an_empty_answer_opens_no_gate(verb: str, registers: list[int]) -> None:
+    """Nothing is written before the hand has told its map, whatever a plan is sent."""
+    driver = Bench().driver
+    sent: list[int] = []
+
+    def exchange(request: Request[Any]) -> list[int]:
+        sent.append(request.frame[1])
+        return registers
+
+    with suppress(DeviceError):
+        run_plan(verbs(driver)[verb], exchange)
+    assert set(sent) == {Function.READ_HOLDING}
+    with pytest.raises(DeviceError, match="nothing is written to it"):
+        driver.check_goal(goal("index", 50))
+
+
+def test_an_empty_answer_is_no_position() -> None:
+    """A stop and an enable that read nothing write nothing."""
+    bench = Bench()
+    bench.run(bench.driver.identify("index"))
+    sent: list[int] = []
+
+    def exchange(request: Request[Any]) -> list[int]:
+        sent.append(request.frame[1])
+        return []
+
+    with pytest.raises(DeviceError, match="incomplete"):
+        run_plan(bench.driver.enable("index"), exchange)
+    reports = run_plan(bench.driver.stop([StopTarget("index", "hold", True)]), exchange)
+    assert (reports["index"].written, reports["index"].confirmed) == (False, False)
+    assert set(sent) == {Function.READ_HOLDING}

@@ -24,7 +24,7 @@ def one(**keys: Any) -> dict[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("kind", ["on_estop", "on_exit", "on_lost_client"])
 def test_no_finger_goes_limp(kind: str) -> None:
-    with pytest.raises(ValidationError, match="no torque command, so nothing can make a finger limp"):
+    with pytest.raises(ValidationError, match="no torque command, and its fingers cannot be made limp"):
         bus_options(one(**{kind: "limp"}))
     assert bus_options(one(**{kind: "hold"})).servos["index"].on_exit == "hold"
 
@@ -86,7 +86,7 @@ def test_limits_in_degrees_are_what_the_finger_reaches(keys: dict[str, Any], fin
     if fine:
         assert set(load_models(options, Path())) == {"legacy", "v1", "v2", "finger"}
     else:
-        with pytest.raises(ConfigError, match=r"outside 100.22 to 178.37, what index reaches"):
+        with pytest.raises(ConfigError, match=r"outside 100.22 to 178.37, the range of index"):
             load_models(options, Path())
 
 
@@ -164,8 +164,8 @@ def test_what_registers_are() -> None:
     assert (v1.named("beep_period").access, v1.named("status").access, v1.named("speed").access) == ("w", "r", "rw")
     assert (v1.named("beep_switch").memory, v1.named("speed").memory) == ("eeprom", "ram")
     assert (v1.named("node_id").default, v1.named("speed").default, v1.named("force_limit").default) == (2, 65535, 15000)
-    assert [v2.named("force_ex").place(channel) for channel in range(6)] == [2000, 2100, 2200, 2300, 2400, 2500]
-    assert v2.named("force_ex").length(5) == 28
+    assert [v2.named("force_ex").address_of(channel) for channel in range(6)] == [2000, 2100, 2200, 2300, 2400, 2500]
+    assert v2.named("force_ex").length_of(5) == 28
     assert set(v2.angles) == set(CHANNELS)
     guarded = {register.name for register in v2.registers.values() if register.guarded}
     assert guarded == {"node_id", "recalibrate", "start_init", "reset", "power_off", "reset_force"}
@@ -174,14 +174,14 @@ def test_what_registers_are() -> None:
 @pytest.mark.parametrize(("raw", "word"), [(-32768, 0x8000), (-1, 0xFFFF), (0, 0), (32767, 0x7FFF)])
 def test_angles_are_twos_complement_in_the_later_maps(raw: int, word: int) -> None:
     register = packaged_models()["v1"].named("angle_target")
-    assert (register.word(raw), register.raw(word)) == (word, raw)
-    assert packaged_models()["legacy"].named("angle_target").raw(0xFFFF) == 65535
+    assert (register.to_word(raw), register.from_word(word)) == (word, raw)
+    assert packaged_models()["legacy"].named("angle_target").from_word(0xFFFF) == 65535
 
 
 @pytest.mark.parametrize("raw", [-32769, 32768])
 def test_beyond_it(raw: int) -> None:
     with pytest.raises(LimitError, match="outside -32768 to 32767"):
-        packaged_models()["v1"].named("angle_target").word(raw)
+        packaged_models()["v1"].named("angle_target").to_word(raw)
 
 
 def test_a_map_that_lacks_a_part_is_refused(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ READ = 3
 @MAPS
 def test_feedback_is_one_read_and_health_the_fewest(name: str) -> None:
     bench = bench_of(name).enable()
-    for number, digit in enumerate(bench.hand.digits):
+    for number, digit in enumerate(bench.hand.fingers):
         digit.position = 65535 * number / 5
         digit.current = 100 * number
         digit.status = number
@@ -57,9 +57,9 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
         bench.run(bench.driver.enable(servo))
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
     assert max(request.frame[5] for request in bench.said if request.frame[1] == READ) == 12
-    with pytest.raises(NotSupported, match=r"18 words, the line carries 12 at once: read it in parts, 2000:12"):
+    with pytest.raises(NotSupported, match=r"has 18 words, one read on this line 12: read it in parts, 2000:12"):
         bench.driver.read_register("thumb_bend", "force_ex")
-    with pytest.raises(LimitError, match="LEN up to 12"):
+    with pytest.raises(LimitError, match="LEN 1 to 12"):
         bench.driver.read_register("index", "2000:13")
     assert bench.read("index", "2000:12") == [0] * 12
 
@@ -67,7 +67,7 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
 @MAPS
 def test_state_is_place_and_status_in_one_read(name: str) -> None:
     bench = bench_of(name).enable()
-    bench.hand.digits[2].position, bench.hand.digits[2].status = 65535, 5
+    bench.hand.fingers[2].position, bench.hand.fingers[2].status = 65535, 5
     request = bench.driver.read_state("middle")
     assert request is bench.driver.read_state("middle")
     state = bench.exchange(request)["middle"]
@@ -101,7 +101,7 @@ def test_what_cannot_be_read_is_refused_here() -> None:
     with pytest.raises(NotSupported, match="thumb_rotation has no register force_limit: only thumb_bend"):
         bench.driver.read_register("thumb_rotation", "force_limit")
     for span in ("1000:0", "1000:65", "65535:2"):
-        with pytest.raises(LimitError, match="no span"):
+        with pytest.raises(LimitError, match="LEN 1 to 64"):
             bench.driver.read_register("index", span)
     assert bench.driver.read_register("index", "65535:1").frame[5] == 1
     assert bench.driver.read_register("index", "1000:64").frame[5] == 64
@@ -115,7 +115,7 @@ def test_registers_are_written_once_and_read_back() -> None:
     assert bench.write("index", "force_limit", 5) == 5
     assert bench.frames() == ["unit 2 WRITE 1116 = 5000", "unit 2 READ 1116"]
     assert bench.write("index", "speed", 32768, raw=True) == 32768
-    assert bench.driver.fingers["index"].settings["speed"] == 32768
+    assert bench.driver.fingers["index"].held.settings["speed"] == 32768
     assert bench.write("index", "beep_switch", 0, persist=True) == 0
     assert bench.write("index", "beep_period", 0.25) == 0.25
 
@@ -133,8 +133,8 @@ def test_registers_of_other_verbs_are_not_written_by_name() -> None:
         "angle_target": "use move",
         "cali_thumb_pos": "several words",
         "reserved": "several words",
-        "beep_switch": "say persist",
-        "cali_end": "say persist",
+        "beep_switch": "add persist",
+        "cali_end": "add persist",
         "position": "can only be read",
     }
     for name, why in refused.items():
@@ -162,7 +162,7 @@ def test_what_is_saved_or_done_each_time_is_never_said_again() -> None:
 
 def test_a_value_that_does_not_read_back_was_not_taken() -> None:
     bench = Bench().enable()
-    bench.hand._put("stall_speed", 1, 7)
+    bench.hand.poke("stall_speed", 1, 7)
     plan = bench.driver.write_register("index", "stall_speed", 9)
     next(plan)
     plan.send(None)
@@ -216,7 +216,7 @@ def _raise(error: Exception) -> Any:
 def test_reasons() -> None:
     bench = Bench().enable()
     assert refused(bench, [1]).message == "no; it is still initialising: wait, then try again (1)"
-    assert refused(bench, [77]).message == "no; a sub-exception no document names (77)"
+    assert refused(bench, [77]).message == "no; a sub-exception that is not documented (77)"
     assert refused(bench, [0]).message == "no"
     assert refused(bench, ReplyTimeout("lost")).message == "no"
     assert refused(bench, [5], 0x0B).message == "no; its last sub-exception: the operation failed (5)"

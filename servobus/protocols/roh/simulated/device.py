@@ -1,8 +1,8 @@
-"""A simulated ROH hand on its line: the seed's section 3 from the other end.
+"""A simulated ROH hand on its line: the device's end of ROH Modbus, 3.
 
-Where the documents are silent it does this, and each can be changed by an attribute at any time: a write of several registers
-stops at the first that is refused, and keeps those before; broadcasts are obeyed and not answered; a new unit is obeyed after the
-answer, and a restart.
+Where the documents are silent: a write of several registers stops at the first that is refused, and those before it are written.
+Broadcasts are obeyed and not answered. A new unit takes effect after the reply and a restart. Attributes change each of these at
+any time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from servobus.protocols.roh.options import RohBus
 from servobus.protocols.roh.simulated.hand import Refusal, SimulatedHand
 
 DELAY = 0.002
-"""Seconds from question to answer; no document names one."""
+"""Seconds from request to reply; no document gives one."""
 ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
 
 
@@ -30,62 +30,62 @@ class RohDevice(SimulatedHand):
         self.baudrate = baudrate
         self.delay = DELAY
         self.extra_delay = 0.0
-        """Seconds that its answers come too late."""
+        """Seconds by which its replies are too late."""
         self._due = -math.inf
         self.dead = False
-        """Hears and says nothing."""
+        """It neither receives nor replies."""
         self.obeys_broadcasts = True
         self.answers_broadcasts = False
         self.answers_restart = True
-        """It answers the write that makes it restart."""
+        """It replies to the write that makes it restart."""
         self.max_registers = MAX_READ
 
     def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
-        """Obey a question, and answer it where the rules of the protocol say so."""
-        everybody = packet.unit == BROADCAST
-        if not (everybody or packet.unit == self.node) or self.dead or now < self._awake or self.state == "update":
+        """Obey a request; see `protocols.base.Device`."""
+        broadcast = packet.unit == BROADCAST
+        if not (broadcast or packet.unit == self.node) or self.dead or now < self._awake or self.state == "update":
             return ()
-        if everybody and (not self.obeys_broadcasts or packet.function == Function.READ_HOLDING):
+        if broadcast and (not self.obeys_broadcasts or packet.function == Function.READ_HOLDING):
             return ()
         self.advance(now)
         unit, awake = self.node, self._awake
         try:
-            answer = encode(unit, packet.function, self._obey(packet))
+            reply = encode(unit, packet.function, self._obey(packet))
         except Refusal as refusal:
             if refusal.sub:
-                self._put("sub_exception", 0, refusal.sub)
-            answer = encode(unit, packet.function | REFUSED, bytes((refusal.code,)))
+                self.poke("sub_exception", 0, refusal.sub)
+            reply = encode(unit, packet.function | REFUSED, bytes((refusal.code,)))
         restarted = self._awake != awake or self.state == "update"
-        if (everybody and not self.answers_broadcasts) or (restarted and not self.answers_restart):
+        if (broadcast and not self.answers_broadcasts) or (restarted and not self.answers_restart):
             return ()
-        # One after the other: a late answer is not overtaken by the next.
+        # In order: a late reply is not overtaken by the next.
         self._due = max(self._due, now + self.extra_delay)
-        return (DeviceReply(answer, self.delay, late=self._due - now),)
+        return (DeviceReply(reply, self.delay, late=self._due - now),)
 
-    # Questions
+    # Requests
 
     def _obey(self, packet: Frame) -> bytes:
-        verb = VERBS.get(packet.function)
-        if verb is None:
+        handler = HANDLERS.get(packet.function)
+        if handler is None:
             raise Refusal(ILLEGAL_FUNCTION)
-        return verb(self, packet.data)
+        return handler(self, packet.data)
 
     def read(self, data: bytes) -> bytes:
         address, count = unpack(data)
         self._require_count(count)
-        found = pack([self.look(place) for place in range(address, address + count)])
-        return bytes((len(found),)) + found
+        registers = pack([self.read_word(each) for each in range(address, address + count)])
+        return bytes((len(registers),)) + registers
 
     def write_single(self, data: bytes) -> bytes:
         address, word = unpack(data)
-        self.write(address, word)
+        self.write_word(address, word)
         return data
 
     def write_multiple(self, data: bytes) -> bytes:
         address, count = unpack(data[:4])
         self._require_count(count)
-        for place, word in enumerate(unpack(data[5:]), address):
-            self.write(place, word)
+        for each, word in enumerate(unpack(data[5:]), address):
+            self.write_word(each, word)
         return data[:4]
 
     def _require_count(self, count: int) -> None:
@@ -93,7 +93,7 @@ class RohDevice(SimulatedHand):
             raise Refusal(ILLEGAL_VALUE)
 
 
-VERBS: dict[int, Callable[[RohDevice, bytes], bytes]] = {
+HANDLERS: dict[int, Callable[[RohDevice, bytes], bytes]] = {
     Function.READ_HOLDING: RohDevice.read,
     Function.WRITE_SINGLE: RohDevice.write_single,
     Function.WRITE_MULTIPLE: RohDevice.write_multiple,
@@ -101,7 +101,7 @@ VERBS: dict[int, Callable[[RohDevice, bytes], bytes]] = {
 
 
 def devices(options: RohBus, models: Mapping[str, RohModel]) -> list[RohDevice]:
-    """The hands of a line, open; one whose map is not pinned has the newest."""
+    """Return the simulated hands of a line, with open fingers. A hand whose map is not pinned has the newest."""
     units = dict.fromkeys(servo.id for servo in options.servos.values())
     maps = {unit: options.map_of(unit) for unit in units}
     return [RohDevice(models[NEWEST if name == "auto" else name], unit, baudrate=options.baudrate) for unit, name in maps.items()]

@@ -1,8 +1,8 @@
-"""The fingers of a simulated ROH hand: motion at a finite speed, and what happens when something is in the way.
+"""A finger of a simulated ROH hand: it moves at a finite speed, and an obstacle may block it.
 
-Where the documents are silent it does this: a blocked finger draws its current limit and says over_current until the stop-after
-period has passed, then it says stuck and draws nothing; where force is measured, force is 10 mN for each mA, and a finger whose
-force limit, or force target, is below that says force_reached and holds there. What blocks stands in the way of closing.
+Where the documents are silent: a blocked finger draws its current limit and reports over_current until the stop-after period has
+passed; then it reports stuck and draws nothing. Its force is 10 mN for each mA. A finger whose force limit or force target is
+below that reports force_reached and holds. An obstacle blocks closing only.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from servobus.protocols.roh.model import FULL
 
-OPENING, CLOSING, REACHED, OVER_CURRENT, FORCE_REACHED, STUCK = range(6)
+TO_OPEN, TO_CLOSED, REACHED, OVER_CURRENT, FORCE_REACHED, STUCK = range(6)
 MOVING_CURRENT = 150
-"""Milliampere."""
+"""mA."""
 GRIP = 10
-"""Millinewton for each milliampere."""
+"""mN for each mA."""
 
 
 @dataclass(slots=True)
@@ -34,18 +34,18 @@ class SimulatedFinger:
     stop_after: float = 0.3
     """Seconds against an obstacle."""
     obstacle: float | None = None
-    """It cannot close beyond."""
+    """The position beyond which it cannot close."""
     status: int = REACHED
     current: int = 0
     force: int = 0
     blocked: float = 0.0
-    """Seconds it has been pushing."""
+    """Seconds it has been pushing against it."""
 
     def advance(self, elapsed: float) -> None:
-        """Be where it is after so many seconds."""
+        """Move on by so many seconds."""
         left = self.target - self.position
-        way = self.speed * elapsed
-        goal = float(self.target) if abs(left) <= way else self.position + math.copysign(way, left)
+        step = self.speed * elapsed
+        goal = float(self.target) if abs(left) <= step else self.position + math.copysign(step, left)
         end = goal if self.obstacle is None else min(goal, max(self.obstacle, min(self.position, goal)))
         if end < goal:
             used = (end - self.position) / self.speed if self.speed else elapsed
@@ -56,7 +56,7 @@ class SimulatedFinger:
         if goal == self.target:
             self.status, self.current = REACHED, 0
         else:
-            self.status, self.current = (CLOSING if left > 0 else OPENING), MOVING_CURRENT
+            self.status, self.current = (TO_CLOSED if left > 0 else TO_OPEN), MOVING_CURRENT
 
     def _push(self, elapsed: float) -> None:
         self.blocked += elapsed

@@ -1,8 +1,8 @@
-"""What is inside a simulated ROH hand: its registers and its fingers, and how each moves the other (seed 4.1).
+"""The inside of a simulated ROH hand: its registers, its fingers, and the effect of one on the other (ROH Modbus, 4.1).
 
-Where the documents are silent it does this: a register that can only be written reads 0; an address no register has, and a write
-to one that can only be read, is refused as illegal address; what a register cannot take is a device failure (invalid data); while
-it initialises or waits for calibration only the system block can be written. Plain attributes may be set at any time.
+Where the documents are silent: a write-only register reads 0. An unknown address, and a write to a read-only register, is refused
+as illegal address. A value that a register cannot have is a device failure (invalid data). While the hand initialises or waits
+for calibration, only the system registers can be written. Attributes may be set at any time.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ SELF_TEST = 0.5
 SYSTEM_END = 1020
 ILLEGAL_ADDRESS, DEVICE_FAILURE = 2, 4
 INITIALISING, UNCALIBRATED, INVALID, STUCK, FAILED, NOT_SAVED = range(1, 7)
-"""Sub-exceptions of a device failure (seed 3.4)."""
+"""Sub-exceptions of a device failure (ROH Modbus, 3.4)."""
 
 
 class Refusal(Exception):
-    """The exception, and the sub-exception of a device failure, that is the answer."""
+    """The exception with which the hand replies, and the sub-exception of a device failure."""
 
     def __init__(self, code: int, sub: int = 0) -> None:
         super().__init__(code, sub)
@@ -31,116 +31,119 @@ class Refusal(Exception):
 
 
 class SimulatedHand:
-    """Registers and fingers of one hand."""
+    """Registers and fingers of one hand. `peek` and `poke` reach each register, as the hand stores it."""
 
     def __init__(self, model: RohModel, unit: int) -> None:
         self.model = model
         self.node = unit
         self.refuses_write_only = False
-        """A register that can only be written is refused when it is read, instead of reading 0."""
+        """A write-only register is refused when it is read, instead of reading 0."""
         self.refuses_reads_while_busy = False
         self.fails: dict[int, int] = {}
-        """Address -> sub-exception that a write to it is refused with."""
+        """Address -> sub-exception with which a write to it is refused."""
         self.key = 0xCA11
-        """What `recalibrate` takes."""
+        """The value that `recalibrate` accepts."""
         self.presses = 1
-        """Times the button confirms until the calibration is done."""
+        """Presses of the button that complete the calibration."""
         self.state = "work"
-        """Or wait (for start_init), init, calibration, update (of the firmware)."""
-        self.digits = [SimulatedFinger(current_limit=model.default_current) for _ in CHANNELS]
+        """work, wait (for start_init), init, calibration, or update (of the firmware)."""
+        self.fingers = [SimulatedFinger(current_limit=model.default_current) for _ in CHANNELS]
         self.beeps: list[int] = []
         """Milliseconds of each beep."""
         self.written: list[tuple[int, int]] = []
-        """Address and word of each write that was taken."""
+        """Address and word of each write that was accepted."""
         self._table = _table(model)
         self._memory = {address: register.default or 0 for address, (register, _) in self._table.items()}
-        self._put("node_id", 0, unit)
-        self._at = self._awake = self._ready = -math.inf
+        self.poke("node_id", 0, unit)
+        self._moved_at = self._awake = self._ready = -math.inf
 
     def advance(self, now: float) -> None:
-        """Be where it is at `now`."""
-        elapsed, self._at = now - self._at, max(now, self._at)
+        """Move to where it is at `now`."""
+        elapsed, self._moved_at = now - self._moved_at, max(now, self._moved_at)
         if self.state == "init" and now >= self._ready:
             self.state = "work"
         if 0 < elapsed < math.inf:
-            for digit in self.digits:
-                digit.advance(elapsed)
+            for finger in self.fingers:
+                finger.advance(elapsed)
 
     def reboot(self, now: float) -> None:
-        """Off and on: what was not saved is lost; with a self-test the fingers open."""
+        """Switch off and on: what was not saved is lost. With a self-test, the fingers open."""
         self.advance(now)
         self._awake = now + self.model.reboot_s
-        self.node = self.get("node_id")
+        self.node = self.peek("node_id")
         for address, (register, _) in self._table.items():
             if register.memory == "ram":
                 self._memory[address] = register.default or 0
-        for digit, number in zip(self.digits, range(len(self.digits)), strict=True):
-            self.digits[number] = SimulatedFinger(digit.position, round(digit.position), current_limit=self.model.default_current)
+        for finger, number in zip(self.fingers, range(len(self.fingers)), strict=True):
+            self.fingers[number] = SimulatedFinger(
+                finger.position, round(finger.position), current_limit=self.model.default_current
+            )
         self.state = "wait"
-        if self.get("self_test"):
+        if self.peek("self_test"):
             self._initialise(self._awake)
 
-    def get(self, name: str, channel: int = 0) -> int:
-        """Raw value of a register as it is stored."""
+    def peek(self, name: str, channel: int = 0) -> int:
+        """Return the stored raw value of a register."""
         register = self.model.named(name)
-        return register.raw(self._memory[register.place(channel)])
+        return register.from_word(self._memory[register.address_of(channel)])
 
-    def look(self, address: int) -> int:
+    def poke(self, name: str, channel: int, raw: int) -> None:
+        """Store a raw value, without any effect on the fingers."""
+        register = self.model.named(name)
+        self._memory[register.address_of(channel)] = register.to_word(raw)
+
+    def read_word(self, address: int) -> int:
         if address not in self._table:
             raise Refusal(ILLEGAL_ADDRESS)
         register, channel = self._table[address]
         if self.refuses_reads_while_busy and address >= SYSTEM_END:
-            self._require_work()
+            self._require_ready()
         if register.access == "w":
             if self.refuses_write_only:
                 raise Refusal(ILLEGAL_ADDRESS)
             return 0
         live = LIVE.get(register.name)
-        if live is not None and channel < len(self.digits):
-            return register.word(live(self, channel))
+        if live is not None and channel < len(self.fingers):
+            return register.to_word(live(self, channel))
         return self._memory[address]
 
-    def write(self, address: int, word: int) -> None:
+    def write_word(self, address: int, word: int) -> None:
         register, channel = self._table.get(address, (None, 0))
         if register is None or register.access == "r":
             raise Refusal(ILLEGAL_ADDRESS)
         if address in self.fails:
             raise Refusal(DEVICE_FAILURE, self.fails[address])
         if address >= SYSTEM_END:
-            self._require_work()
-        raw = register.raw(word)
+            self._require_ready()
+        raw = register.from_word(word)
         if not register.raw_range[0] <= raw <= register.raw_range[1]:
             raise Refusal(DEVICE_FAILURE, INVALID)
         self.written.append((address, word))
         self._memory[address] = word
-        act = ACTS.get(register.name)
-        if act is not None and channel < len(self.digits):
-            act(self, channel, raw)
+        effect = EFFECTS.get(register.name)
+        if effect is not None and channel < len(self.fingers):
+            effect(self, channel, raw)
 
-    def _require_work(self) -> None:
+    def _require_ready(self) -> None:
         if self.state in ("wait", "init"):
             raise Refusal(DEVICE_FAILURE, INITIALISING)
         if self.state == "calibration":
             raise Refusal(DEVICE_FAILURE, UNCALIBRATED)
 
-    def _put(self, name: str, channel: int, raw: int) -> None:
-        register = self.model.named(name)
-        self._memory[register.place(channel)] = register.word(raw)
-
-    # What a write does
+    # Effects of writes
 
     def _aim(self, channel: int, raw: int) -> None:
-        self.digits[channel].target = raw
-        self._put("angle_target", channel, self._angle(channel, raw))
+        self.fingers[channel].target = raw
+        self.poke("angle_target", channel, self._angle(channel, raw))
 
     def _aim_angle(self, channel: int, raw: int) -> None:
-        """What lies outside is replaced by the limit, and reads back so."""
+        """Replace a target outside by the limit, which then reads back."""
         open_, closed = self._ends(channel)
         angle = max(min(open_, closed), min(max(open_, closed), raw))
         position = round(FULL * (angle - open_) / (closed - open_))
-        self.digits[channel].target = position
-        self._put("pos_target", channel, position)
-        self._put("angle_target", channel, angle)
+        self.fingers[channel].target = position
+        self.poke("pos_target", channel, position)
+        self.poke("angle_target", channel, angle)
 
     def _ends(self, channel: int) -> tuple[int, int]:
         open_, closed = self.model.angles[CHANNELS[channel]]
@@ -151,39 +154,39 @@ class SimulatedHand:
         return round(open_ + (closed - open_) * position / FULL)
 
     def _set_speed(self, channel: int, raw: int) -> None:
-        self.digits[channel].speed = raw
+        self.fingers[channel].speed = raw
 
     def _limit_current(self, channel: int, raw: int) -> None:
-        self.digits[channel].current_limit = raw
+        self.fingers[channel].current_limit = raw
 
     def _limit_force(self, channel: int, raw: int) -> None:
-        self.digits[channel].force_limit = raw
+        self.fingers[channel].force_limit = raw
 
     def _aim_force(self, channel: int, raw: int) -> None:
-        self.digits[channel].force_limit = raw or None
+        self.fingers[channel].force_limit = raw or None
 
     def _stop_after(self, channel: int, raw: int) -> None:
-        self.digits[channel].stop_after = raw / 1000
+        self.fingers[channel].stop_after = raw / 1000
 
     def _beep(self, channel: int, raw: int) -> None:
-        if self.get("beep_switch"):
+        if self.peek("beep_switch"):
             self.beeps.append(raw)
 
     def _restart(self, channel: int, raw: int) -> None:
         if not raw:
-            self.reboot(self._at)
+            self.reboot(self._moved_at)
         else:
             self.state = "update"
 
     def _move_to_unit(self, channel: int, raw: int) -> None:
-        self._put("node_id", 0, raw & 0xFF)
-        self.reboot(self._at)
+        self.poke("node_id", 0, raw & 0xFF)
+        self.reboot(self._moved_at)
 
     def _recalibrate(self, channel: int, raw: int) -> None:
         if raw != self.key:
             raise Refusal(DEVICE_FAILURE, INVALID)
         self.state = "calibration"
-        self._put("button_press_cnt", 0, 0)
+        self.poke("button_press_cnt", 0, 0)
 
     def _press(self, channel: int, raw: int) -> None:
         if self.state == "calibration" and raw >= self.presses:
@@ -192,27 +195,27 @@ class SimulatedHand:
     def _start_init(self, channel: int, raw: int) -> None:
         if self.state != "wait":
             raise Refusal(DEVICE_FAILURE, FAILED)
-        self._initialise(self._at)
+        self._initialise(self._moved_at)
 
     def _initialise(self, begin: float) -> None:
         self.state, self._ready = "init", begin + SELF_TEST
-        for digit in self.digits:
-            digit.target = 0
+        for finger in self.fingers:
+            finger.target = 0
 
     def _zero_force(self, channel: int, raw: int) -> None:
-        for digit in self.digits:
-            digit.force = 0
+        for finger in self.fingers:
+            finger.force = 0
 
 
 LIVE: dict[str, Callable[[SimulatedHand, int], int]] = {
-    "pos": lambda hand, channel: round(hand.digits[channel].position),
-    "angle": lambda hand, channel: hand._angle(channel, hand.digits[channel].position),
-    "pos_target": lambda hand, channel: hand.digits[channel].target,
-    "status": lambda hand, channel: hand.digits[channel].status,
-    "current": lambda hand, channel: hand.digits[channel].current,
-    "force": lambda hand, channel: hand.digits[channel].force,
+    "pos": lambda hand, channel: round(hand.fingers[channel].position),
+    "angle": lambda hand, channel: hand._angle(channel, hand.fingers[channel].position),
+    "pos_target": lambda hand, channel: hand.fingers[channel].target,
+    "status": lambda hand, channel: hand.fingers[channel].status,
+    "current": lambda hand, channel: hand.fingers[channel].current,
+    "force": lambda hand, channel: hand.fingers[channel].force,
 }
-ACTS: dict[str, Callable[[SimulatedHand, int, int], None]] = {
+EFFECTS: dict[str, Callable[[SimulatedHand, int, int], None]] = {
     "pos_target": SimulatedHand._aim,
     "angle_target": SimulatedHand._aim_angle,
     "speed": SimulatedHand._set_speed,
@@ -231,13 +234,12 @@ ACTS: dict[str, Callable[[SimulatedHand, int, int], None]] = {
 
 
 def _table(model: RohModel) -> dict[int, tuple[RohRegister, int]]:
-    """Address -> register, and the channel it is of."""
+    """Return address -> its register and channel."""
     table = {}
     for register in model.registers.values():
         for channel in range(max(1, register.channels)):
-            size = register.words if isinstance(register.words, int) else register.words[channel]
             first = register.address + channel * register.stride
-            for address in range(first, first + size):
+            for address in range(first, first + register.length_of(channel)):
                 assert address not in table, f"{model.name}: two registers at {address}"
                 table[address] = (register, channel)
     return table

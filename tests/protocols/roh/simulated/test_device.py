@@ -111,7 +111,7 @@ def test_angles_follow_and_are_kept_within_reach(name: str) -> None:
 
 def test_an_obstacle_stalls_a_finger() -> None:
     hand = hand_of("v1")
-    hand.digits[1].obstacle = 20000
+    hand.fingers[1].obstacle = 20000
     put(hand, 1116, 65535)
     put(hand, 1126, 20000)
     put(hand, 1136, 65535)
@@ -123,14 +123,14 @@ def test_an_obstacle_stalls_a_finger() -> None:
 
 def test_a_gentle_finger_stops_at_its_force() -> None:
     hand = hand_of("v1")
-    hand.digits[1].obstacle = 20000
+    hand.fingers[1].obstacle = 20000
     put(hand, 1096, 600)
     put(hand, 1116, 3000)
     put(hand, 1136, 65535)
     assert look(hand, 1086, now=3.0) == [4]
     assert look(hand, 1121, now=3.0) == [3000]
     later = hand_of("v2")
-    later.digits[1].obstacle = 0
+    later.fingers[1].obstacle = 0
     put(later, 1116, 2000)
     put(later, 1195 + 11, 5000)
     put(later, 1136, 65535)
