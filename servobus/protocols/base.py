@@ -1,7 +1,7 @@
-"""The words every protocol shares: requests that know their reply, codecs without I/O, plans, and what a driver offers.
+"""The interfaces of a protocol: request, reply, codec, plan, and the roles of a driver. `docs/writing-a-driver.md` explains them.
 
-Two rules hold for everything below this folder: no I/O and no clock. A codec is fed bytes and hands out replies; a plan is a
-generator that yields requests and is sent what they returned, or has their error thrown into it. Whoever runs them owns the time.
+Nothing in this package does I/O or knows the time. A codec receives bytes and returns replies. A plan is a generator that yields
+requests and is sent their values, or has their errors thrown in. The engine runs plans and owns the time.
 """
 
 from __future__ import annotations
@@ -15,28 +15,27 @@ from servobus.errors import DeviceError, NotSupported, ServobusError
 from servobus.values import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
 class LineTraits:
-    """What a link says of its line. Times in seconds."""
+    """What a link knows about its line. Times in seconds."""
 
     baudrate: int | None = None
     """None: bytes take no time of their own (memory, TCP)."""
     paced: bool = False
-    """Bytes really take their wire time, so whatever is heard before the request can have left is no answer to it."""
+    """Bytes really take their wire time, so bytes received before the request can have left are not a reply to it."""
     latency: float = 0.0
-    """What adapter, driver or tunnel add to every reply."""
+    """Delay that adapter, driver or tunnel add to every reply."""
     turn: float = 0.0
-    """What a tunnel takes for each turn, beside the bytes of the line behind it."""
+    """Time that a tunnel needs for each turn, beside the bytes of the line behind it."""
     gap: float = 0.0
     """Silence before each frame."""
     can_change_baud: bool = False
     max_read: int | None = None
-    """Registers that one read can bring through a tunnel; None: as many as the protocol has room for."""
+    """Registers that one read can bring through a tunnel; None: as many as the protocol allows."""
     max_write: int | None = None
-    """Registers that one write can carry through it, likewise."""
+    """Registers that one write can carry through a tunnel, likewise."""
 
     @property
     def byte_time(self) -> float:
@@ -45,86 +44,86 @@ class LineTraits:
 
 
 class Reply(Protocol):
-    """One frame heard on the line."""
+    """One valid frame received from the line."""
 
     @property
     def node(self) -> int:
-        """The id the frame names."""
+        """The id in the frame."""
 
     @property
     def frame(self) -> bytes:
-        """Its bytes as heard."""
+        """The bytes of the frame."""
 
     @property
     def key(self) -> Hashable:
-        """What tells this reply from others of the same node; compare `Request.reply_key`."""
+        """What distinguishes this reply from others of the same node; see `Request.reply_key`."""
 
     @property
     def status(self) -> int | None:
-        """The health byte, where the protocol has one in each reply."""
+        """The health byte; None: replies of this protocol have none."""
 
 
 class Request(ABC, Generic[R]):
-    """One thing to say, and everything about its answer. Immutable: one object may be sent many times."""
+    """One request, and everything about its replies. Immutable: one object may be sent many times."""
 
     node: int
-    """The id addressed; the broadcast id for a broadcast."""
+    """The id it is addressed to; the broadcast id for a broadcast."""
     frame: bytes
     """The bytes on the wire."""
     replies: int = 1
     """How many replies are due: 0 after a broadcast, several for a group read."""
     nodes: tuple[int, ...]
-    """Which nodes answer; empty: any one."""
+    """The nodes that answer; empty: any one."""
     reply_size: int = 0
     """Bytes of each reply frame."""
     reply_key: Hashable = None
-    """What the reply looks like: two requests with the same key have replies that can be mistaken for each other."""
+    """Two requests with the same key have replies that can be mistaken for each other."""
     idempotent: bool = True
-    """May be said again when no answer came."""
+    """It may be sent again when no reply came."""
     quiet_after: float = 0.0
-    """Seconds of silence that must follow."""
+    """Seconds of silence that must follow the request."""
     service_time: float = 0.0
     """Seconds the device may need beyond its usual delay (flash write, reboot)."""
     mirrored: bool = False
-    """The right answer is the request itself, said back: only for lines known to have no echo."""
+    """The right reply has the same bytes as the request: only for lines that are known to have no echo."""
     partial: bool = False
-    """Fewer replies than due are a result too: the nodes that are missing become doubtful, the others are believed."""
+    """Fewer replies than due are a result too: the missing nodes become doubtful, the others are believed."""
 
     @abstractmethod
     def answers(self, reply: Any) -> bool:
-        """Whether this reply, and no other, can be the answer (or one of the answers)."""
+        """Return whether this can be the reply, or one of the replies."""
 
     @abstractmethod
     def parse(self, replies: Sequence[Any]) -> R:
-        """The value of the replies, in the order heard. Raises DeviceError or EchoMismatch."""
+        """Return the value of the replies, which are in the order received. Raises DeviceError or EchoMismatch."""
 
     def plain(self) -> Request[R] | None:
-        """The same question asked so that its own echo cannot be an answer; None where the echo never can."""
+        """Return a request for the same value whose echo cannot be its reply; None: the echo of this one never can."""
         return None
 
 
 class Codec(Protocol):
-    """Bytes in, replies out. One per bus."""
+    """Finds replies in a stream of bytes. One per bus; `protocols.stream.StreamCodec` is the usual base."""
 
     def receive_data(self, data: bytes) -> None:
-        """Append what was heard."""
+        """Append received bytes."""
 
     def next_reply(self) -> Reply | None:
-        """The next whole valid frame; None: feed me more. Bytes that are no frame are skipped."""
+        """Return the next whole valid frame; None: more bytes are needed. Bytes that belong to no frame are skipped."""
 
     @property
     def pending(self) -> int:
-        """Bytes heard that are no frame yet."""
+        """Bytes received that are no frame yet."""
 
     @property
     def skipped(self) -> int:
-        """Bytes skipped since the beginning because they were no frame."""
+        """Bytes skipped since the beginning because they belong to no frame."""
 
     def reset(self) -> None:
-        """Forget what was heard."""
+        """Forget the received bytes."""
 
     def describe(self, frame: bytes, *, sent: bool) -> str:
-        """One line of words for a frame, for people."""
+        """Return one line of text about a frame, for people."""
 
 
 Plan: TypeAlias = Generator[Request[Any], Any, R]
@@ -132,13 +131,13 @@ Plan: TypeAlias = Generator[Request[Any], Any, R]
 
 
 def ask(request: Request[R]) -> Plan[R]:
-    """One request as a step of a plan, typed: `value = yield from ask(request)`."""
+    """Make one request a step of a plan, with its type: `value = yield from ask(request)`."""
     value: R = yield request
     return value
 
 
 def run_plan(plan: Plan[R], exchange: Callable[[Request[Any]], Any]) -> R:
-    """Run a plan by a plain function: for tests, previews and simulated devices. Errors raised by it go into the plan."""
+    """Run a plan with a plain function, for tests. A ServobusError that the function raises goes into the plan."""
     try:
         request = next(plan)
         while True:
@@ -155,7 +154,7 @@ def run_plan(plan: Plan[R], exchange: Callable[[Request[Any]], Any]) -> R:
 
 @dataclass(frozen=True, slots=True)
 class GoalPlan:
-    """What the wire sees of some goals: one uninterrupted plan that ends in an outcome or an error per servo."""
+    """The plan that carries some goals, uninterrupted but for an e-stop. It returns an outcome or an error for each servo."""
 
     servos: tuple[str, ...]
     plan: Plan[dict[str, Outcome | Exception]]
@@ -164,7 +163,7 @@ class GoalPlan:
 
 @dataclass(frozen=True, slots=True)
 class Poll:
-    """A read on a fixed grid: `request` makes it anew for the servos that are reachable, or None if none is."""
+    """A read at a fixed rate. `request` returns it for the nodes that are reachable; None: nothing is to be read."""
 
     name: str
     hz: float
@@ -216,50 +215,55 @@ class Addressing(ABC):
 
     @abstractmethod
     def ping(self, node: int) -> Request[int | None]:
-        """Return the request whose reply shows that the node is there; its value is the status byte, if there is one."""
+        """Return the request whose reply shows that the node is there; its value is the status byte, or None."""
 
     @abstractmethod
     def unused(self) -> Request[Any]:
-        """Return a request that no node answers: what comes back is the adapter's echo."""
+        """Return a request that no node answers, so that all bytes received after it are the adapter's echo."""
 
     @abstractmethod
     def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
-        """Ask the node something whose reply cannot be confused with a late one.
+        """Return the plan that makes a node believable again; see `protocols.fence`.
 
-        `avoid`: the reply keys that may still be under way, oldest first. `enabled`: the servos of this node that servobus has
-        enabled. Returns False when one of those lost what `enable` wrote, so the node has restarted.
+        Args:
+            avoid: the reply keys that may still be under way, oldest first; the fence's own reply must have another.
+            enabled: the servos of this node that are enabled. The plan returns False when one of them lost what `enable` wrote,
+                because then the node has restarted.
         """
 
     @abstractmethod
     def inspect(self, node: int) -> Plan[Identity]:
-        """Ask a node who it is, whether it is configured or not."""
+        """Return the plan that asks any node, configured or not, who it is."""
 
     @abstractmethod
     def identify(self, servo: str) -> Plan[Identity]:
-        """Ask a configured servo who it is and whether it fits its options. Learns what the other verbs need; writes nothing."""
+        """Return the plan that asks a configured servo who it is and notes what does not fit its options.
+
+        It learns what the other verbs need (mode, limits, register map), and writes nothing.
+        """
 
 
 class Reading(ABC):
-    """What servos tell."""
+    """What servos report."""
 
     @abstractmethod
     def read_state(self, servo: str) -> Request[dict[str, Update]]:
-        """Return the request that brings every field of `State` the servo has, by servo name."""
+        """Return the request that brings the fields of `State` that one turn can bring, by servo name."""
 
     @abstractmethod
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
-        """Return the fewest reads that keep every servo's state fresh at these rates (Hz)."""
+        """Return the fewest reads that keep every servo's state fresh. `rates`: `feedback` and `health` -> Hz."""
 
     @abstractmethod
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
-        """Return a read of the physical value, or of the integer with `raw`. Raises UnknownName, NotSupported."""
+        """Return the read of a register's physical value, or of its integer with `raw`. Raises UnknownName, NotSupported."""
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
         """Return the names of the faults in a status byte."""
         return ()
 
     def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError] | None:
-        """Return a plan that asks a servo why it refused, and returns the error to raise instead. None: no question."""
+        """Return the plan that asks a servo why it refused and returns the error to raise instead; None: it cannot be asked."""
         return None
 
 
@@ -267,7 +271,7 @@ class Writing:
     """Settings."""
 
     def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:
-        """Write and confirm; the plan returns the value that is then in the register.
+        """Return the plan that writes a register and returns the value that it has then.
 
         Raises LimitError, UnknownName, NotSupported before the first frame.
         """
@@ -283,15 +287,21 @@ class Motion(ABC):
 
     @abstractmethod
     def enable(self, servo: str) -> Plan[float | None]:
-        """Goal := present, then torque on, read back; returns the present position in the servo's unit."""
+        """Return the plan: goal := present, torque on, both read back. Its value is the present position in the servo's unit.
+
+        The joint must not move. The plan raises NotSupported where it would, and ends with torque off when it fails half-way.
+        """
 
     @abstractmethod
     def disable(self, servo: str) -> Plan[StopReport]:
-        """Torque off, read back."""
+        """Return the plan: torque off, read back."""
 
     @abstractmethod
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
-        """Stop servos: first everything that can be written at once, then what needs a question."""
+        """Return the plan that stops servos: first everything that can be written at once, then everything that needs a reply.
+
+        One servo that does not answer must not delay the others by more than its own turn.
+        """
 
     @abstractmethod
     def check_goal(self, goal: ServoGoal) -> Any:
@@ -303,7 +313,12 @@ class Motion(ABC):
 
     @abstractmethod
     def plan_goals(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
-        """Return the fewest plans that carry these goals; with `together` one plan. Raises NotSupported."""
+        """Return the fewest plans that carry these goals. Raises NotSupported.
+
+        Args:
+            together: the servos start at the same moment, so all goals are in one plan.
+            confirm: each goal is acknowledged by its servo.
+        """
 
     def host_speed(self, goal: ServoGoal) -> float | None:
         """Return the speed (unit/s) that the host must keep on the way to this goal; None: the servo keeps its own."""
@@ -311,13 +326,13 @@ class Motion(ABC):
 
 
 class Driver(Addressing, Reading, Writing, Motion, ABC):
-    """A protocol on one bus: which requests each verb takes. Sans-IO; knows its servos by name and every node by id."""
+    """A protocol on one bus: the requests of each verb. Sans-IO; it knows its servos by name and every node by id."""
 
     commissioning: Commissioning | None = None
     """None: this protocol's servos are given ids and rates with other tools."""
 
     def use_traits(self, traits: LineTraits) -> None:
-        """Learn what the line carries; called before the first request."""
+        """Learn what the line can carry; called before the first request."""
 
     def preview_goals(self, goals: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
         """Return the frames that these goals take once the servos hold their settings. Changes no state, and asks nothing."""
@@ -341,24 +356,24 @@ class Driver(Addressing, Reading, Writing, Motion, ABC):
 
 @dataclass(frozen=True, slots=True)
 class DeviceReply:
-    """What a simulated device says: after `delay` seconds from the end of the request, and after the replies of lower slots."""
+    """What a simulated device sends: `delay` seconds after the end of the request, and after the replies of lower slots."""
 
     data: bytes
     delay: float = 0.0
     slot: int = 0
     late: float = 0.0
-    """More delay, that of a fault: it stays even on a line whose bytes take no time."""
+    """More delay, caused by a fault: it counts also on a line whose bytes take no time."""
 
 
 class Device(Protocol):
-    """A simulated node: the same frames and the same register map, from the other end. Sans-IO; it is told the time."""
+    """A simulated node: the other end of the same frames and the same register map. Sans-IO; the caller passes the time."""
 
     @property
     def node(self) -> int: ...
 
     @property
     def baudrate(self) -> int:
-        """It hears nothing that is said at another rate."""
+        """The rate it is set to; it understands no other."""
 
     def handle(self, packet: Any, now: float) -> Sequence[DeviceReply]:
-        """A whole valid frame was on the line (for this node or another); `now` in monotonic seconds."""
+        """Return the replies to a whole valid frame, which may be for another node. `now`: monotonic seconds."""

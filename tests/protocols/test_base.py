@@ -9,7 +9,6 @@ import pytest
 
 from servobus.errors import LinkDown, ReplyTimeout
 from servobus.protocols.base import LineTraits, Plan, Request, ask, run_plan
-from servobus.protocols.registry import PROTOCOLS
 
 
 class Number(Request[int]):
@@ -118,17 +117,3 @@ def test_what_a_request_is_unless_it_says_otherwise() -> None:
 @pytest.mark.parametrize(("baudrate", "seconds"), [(1_000_000, 10e-6), (115_200, 10 / 115_200), (None, 0.0)])
 def test_a_byte_takes_ten_bits(baudrate: int | None, seconds: float) -> None:
     assert LineTraits(baudrate).byte_time == pytest.approx(seconds)
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_a_line_of_the_table_is_whole(name: str) -> None:
-    entry = PROTOCOLS[name]
-    keys = {"protocol": name, "port": "sim:", "baudrate": entry.baudrates[0]}
-    options = entry.options.model_validate(keys)
-    assert options.protocol == name
-    assert len(set(entry.baudrates)) == len(entry.baudrates)
-    for codec in (entry.codec(options), entry.codec(None), entry.device_codec(options)):
-        codec.receive_data(b"\x00")
-        assert codec.next_reply() is None
-    assert entry.driver(options, {}).nodes == {}
-    assert entry.devices(options, {}) == []
