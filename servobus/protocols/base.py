@@ -320,6 +320,17 @@ class Motion(ABC):
             confirm: each goal is acknowledged by its servo.
         """
 
+    @abstractmethod
+    def preview_goals(self, goals: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
+        """Return the frames that these goals take once the servos hold their settings. Changes no state, and asks nothing."""
+
+    @abstractmethod
+    def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
+        """Return the frames that a stop sends before it waits for a reply; where each needs a reply, one for each node.
+
+        Changes no state, and asks nothing.
+        """
+
     def host_speed(self, goal: ServoGoal) -> float | None:
         """Return the speed (unit/s) that the host must keep on the way to this goal; None: the servo keeps its own."""
         return None
@@ -333,25 +344,6 @@ class Driver(Addressing, Reading, Writing, Motion, ABC):
 
     def use_traits(self, traits: LineTraits) -> None:
         """Learn what the line can carry; called before the first request."""
-
-    def preview_goals(self, goals: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
-        """Return the frames that these goals take once the servos hold their settings. Changes no state, and asks nothing."""
-        requests: list[Request[Any]] = []
-        for _ in range(2 if goals else 0):
-            requests.clear()
-            for turn in self.plan_goals(goals, together=False, confirm=False):
-                run_plan(turn.plan, requests.append)
-        return requests
-
-    def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
-        """Return the frames that a stop sends before it waits for a reply; where it cannot write to several servos at once, one
-        request for each node. Changes no state, and asks nothing."""
-        requests: list[Request[Any]] = []
-        for request in self.stop(targets) if targets else ():
-            if request.replies:
-                return requests or [request] * len({self.nodes[target.servo] for target in targets})
-            requests.append(request)
-        return requests
 
 
 @dataclass(frozen=True, slots=True)
