@@ -162,6 +162,7 @@ async def test_in_memory(kind: str, protocol: str) -> None:
         await _every_verb(rig, protocol, MATRIX[kind])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", MATRIX)
 async def test_on_a_pty(kind: str, protocol: str) -> None:

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from tests.benchmarks import goals, responder, turns
-from tests.benchmarks.report import Report, Target
+from tests.benchmarks.report import Report, Row, Target
+
+pytestmark = pytest.mark.slow
 
 SECONDS = 0.05
 
@@ -41,7 +43,7 @@ def test_the_responder_answers_like_a_servo() -> None:
 
 
 def test_a_report_names_the_targets_that_were_missed() -> None:
-    rows = {"a": {"turns/s": 2.0}, "b": {"turns/s": None}}
+    rows: dict[str, Row] = {"a": {"turns/s": 2.0}, "b": {"turns/s": None}}
     targets = [Target("a", "turns/s", minimum=3), Target("a", "turns/s", maximum=3), Target("b", "turns/s", minimum=1)]
     report = Report("title", rows, [*targets, Target("absent", "turns/s", minimum=1)])
     assert report.missed() == ["a: turns/s at least 3, measured 2"]

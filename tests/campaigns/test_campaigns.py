@@ -10,6 +10,8 @@ from tests.campaigns import dead_servo, faults, slow_hand
 from tests.campaigns.faults import KINDS, Result
 from tests.campaigns.oracle import ORACLES
 
+pytestmark = pytest.mark.slow
+
 
 def assert_right(result: Result) -> None:
     assert (result.wrong, result.hung, result.leaked, result.waiting) == (0, 0, 0, 0)

@@ -20,12 +20,6 @@ def _logging_as_before() -> Iterator[None]:
     logger.setLevel(logging.NOTSET)
 
 
-@pytest.fixture(autouse=True)
-def _no_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Whatever runs on this machine is not spoken to."""
-    monkeypatch.setenv("SERVOBUS_SOCKET", str(tmp_path / "no.sock"))
-
-
 @pytest.fixture
 def terminal() -> Iterator[Terminal]:
     with closing(Terminal()) as made:

@@ -13,9 +13,6 @@ from typing import IO
 
 from tests.config.mistakes import GOOD
 
-PLAIN = {
-    name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR", "COLUMNS", "SERVOBUS_CONFIG"}
-}
 LIMP = GOOD.replace("id: 1,", "id: 1, on_exit: limp,")
 
 
@@ -28,7 +25,7 @@ def servobus(
         stdout=stdout,
         stderr=stderr,
         text=True,
-        env={**PLAIN, **environment},
+        env={**os.environ, **environment},
     )
     try:
         yield process

@@ -12,6 +12,8 @@ import pytest
 from tests.cli.processes import LIMP, servobus, until
 from tests.config.mistakes import GOOD
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_run_ends_in_order(rig: str, number: signal.Signals, status: int) -> None:

@@ -8,6 +8,8 @@ import pytest
 
 from tests.cli.processes import Terminal, servobus
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_monitor_on_a_terminal_is_a_table_without_folds(rig: str, terminal: Terminal) -> None:
     arguments = ("monitor", "-c", rig, "--count", "2", "--hz", "50")

@@ -20,6 +20,8 @@ from servobus.rig.opening import open_rig
 from servobus.values import Outcome
 from tests.clients.bus_process import served
 
+pytestmark = pytest.mark.slow
+
 HAND = """\
 version: 1
 buses:

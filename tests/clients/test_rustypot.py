@@ -11,6 +11,8 @@ import rustypot
 
 from tests.clients.bus_process import served
 
+pytestmark = pytest.mark.slow
+
 STS3215 = 777
 IDS = [1, 2, 3]
 STANDING = [2048, 1000, 3000]

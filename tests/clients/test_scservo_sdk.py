@@ -10,6 +10,8 @@ import scservo_sdk
 
 from tests.clients.bus_process import served
 
+pytestmark = pytest.mark.slow
+
 GOAL_POSITION, PRESENT_POSITION, LOCK, ID, MOVING, TORQUE = 42, 56, 55, 5, 66, 40
 STS3215 = 777
 STANDING = {1: 2048, 2: 1000, 3: 3000}

@@ -10,8 +10,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
+
 from tests.cli.processes import servobus, until
 from tests.config.mistakes import GOOD
+
+pytestmark = pytest.mark.slow
 
 DESCRIPTORS = 64
 """What the daemon may open; a few are its own."""

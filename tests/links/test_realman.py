@@ -19,6 +19,8 @@ from servobus.rig.opening import open_rig
 from servobus.simulation.arm_server import ArmFaults, ArmServer
 from servobus.values import Outcome
 
+pytestmark = pytest.mark.slow
+
 FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
 GENERATIONS = pytest.mark.parametrize("generation", [2, 3, 4])
 
