@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from servobus.engine.health import FIRST_DEADLINE
+from servobus.engine.health import FIRST_ALLOWANCE
 from servobus.engine.line import QUIET
 from servobus.protocols.base import Driver, LineTraits, Request
 from servobus.protocols.options import BusOptions, ServoOptions
@@ -52,7 +52,7 @@ def line_bandwidth(options: BusOptions, driver: Driver, traits: LineTraits) -> B
             seconds = _seconds([request], traits)
             shares[poll.name] = shares.get(poll.name, 0.0) + 100 * poll.hz * seconds
             longest = max(longest, seconds)
-    silent = min(FIRST_DEADLINE, (options.timeout_ms or 1000) / 1000) + QUIET
+    silent = min(FIRST_ALLOWANCE, (options.timeout_ms or 1000) / 1000) + QUIET
     return Bandwidth(
         shares,
         goal_latency=2 * longest + _seconds(goals, traits) + traits.latency,

@@ -1,80 +1,104 @@
-"""Meeting the servos of a bus: when its line comes up, and when one appears later. Writes nothing."""
+"""Identifies the servos of a bus: when its line comes up, when one appears later, and after a restart. Writes nothing."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
 
 from servobus.bus.records import ServoRecord
-from servobus.engine.health import Condition, Node
+from servobus.bus.requests import PATIENCE, BusParts, Requests
+from servobus.engine.health import OFFLINE, ONLINE, Node
+from servobus.engine.job import Callback, Job
 from servobus.engine.line import EchoFilter
-from servobus.engine.queue import Callback, Job
+from servobus.engine.stats import Counter
 from servobus.errors import LinkDown, ReplyTimeout, ServobusError
-from servobus.values import Identity
+from servobus.protocols.base import Plan
+from servobus.values import EventName, Health, Identity, State
 
-if TYPE_CHECKING:
-    from servobus.bus.service import BusService
-
-PATIENCE = 2.0
-"""Seconds that the question may wait for its turn."""
 PAUSE = 1.0
-"""Seconds between two attempts to learn who a servo is that answers, but not to that."""
+"""Seconds between two attempts to identify a servo that answers other requests, but not that one."""
 
 
 class Discovery:
-    """Who is there, once for each node: what one servo says of it holds for the others."""
+    """Who is there, once for each node: what one servo tells of its node holds for the others of that node."""
 
-    def __init__(self, bus: BusService) -> None:
-        self._bus = bus
-
-    async def identify_all(self) -> None:
-        """A missing servo is an event, no error."""
-        nodes = dict.fromkeys(record.node for record in self._bus.records.values())
-        await asyncio.gather(*map(self._meet, nodes))
+    def __init__(self, parts: BusParts, requests: Requests, read: Callable[[str], Awaitable[State]]) -> None:
+        self._parts = parts
+        self._requests = requests
+        self._read = read
 
     async def probe_echo(self) -> None:
-        """A question nobody answers: what is heard is our own voice."""
-        bus = self._bus
-        before = bus.stats.counts["echoes"]
+        """Find out whether the line echoes: send a request that no servo answers, so what comes back is our own."""
+        parts = self._parts
+        before = parts.stats.counts[Counter.ECHOES]
         try:
-            await bus.ask(bus.driver.unused(), tries=1)
+            await self._requests.ask(parts.driver.unused(), tries=1)
         except ReplyTimeout:
             pass
         except LinkDown:
             return
-        if bus.stats.counts["echoes"] > before:
-            bus.line.echo = EchoFilter()
-        bus.event("echo_probed", bus=bus.name, echo="on" if bus.line.echo else "off")
+        if parts.stats.counts[Counter.ECHOES] > before:
+            parts.line.echo = EchoFilter()
+        parts.emit(EventName.ECHO_PROBED, bus=parts.name, echo="on" if parts.line.echo else "off")
 
-    async def _meet(self, node: Node) -> None:
-        bus = self._bus
-        records = bus.on(node)
+    async def identify_all(self) -> None:
+        """Identify every node and read every servo. A missing servo is an event, not an error."""
+        nodes = dict.fromkeys(record.node for record in self._parts.records.values())
+        await asyncio.gather(*map(self._identify_node, nodes))
+
+    async def _identify_node(self, node: Node) -> None:
+        records = self._parts.on(node)
+        self.restarted(node)
         try:
-            await bus.identify(records[0].name)
+            await self.identify(records[0].name)
             for record in records:
-                await bus.read(record.name)
+                await self._read(record.name)
         except ServobusError as error:
             names = ",".join(record.name for record in records)
-            bus.event("servo_missing", bus=bus.name, servo=names, id=node.id, reason=error.message)
+            self._parts.emit(EventName.SERVO_MISSING, bus=self._parts.name, servo=names, id=node.id, reason=error.message)
 
-    def identified(self, record: ServoRecord, identity: Identity) -> None:
-        """Somebody was asked who it is."""
-        if record.identity != identity:
-            for note in identity.notes:
-                self._bus.event("servo_note", bus=self._bus.name, servo=record.name, note=note)
-        for other in self._bus.on(record.node):
-            other.identity = identity
+    async def identify(self, servo: str) -> Identity:
+        """Ask a servo who it is, even if it is offline."""
+        record = self._parts.records[servo]
+        plan = self._parts.driver.identify(servo)
+        identity = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True)
+        self._identified(record, identity)
+        return identity
 
-    def changed(self, node: Node, now: float) -> None:
-        """One that was missing at the start has appeared."""
-        record = self._bus.on(node)[0]
-        if node.condition is not Condition.ONLINE or record.identity is not None or now < record.identify_after:
+    def _identified(self, record: ServoRecord, result: Identity | Exception) -> None:
+        if isinstance(result, Exception):
             return
-        record.identify_after = now + PAUSE
+        if record.identity != result:
+            for note in result.notes:
+                self._parts.emit(EventName.SERVO_NOTE, bus=self._parts.name, servo=record.name, note=note)
+        for other in self._parts.on(record.node):
+            other.identity = result
 
-        def introduced(result: Identity | Exception) -> None:
-            if isinstance(result, Identity):
-                self.identified(record, result)
+    def node_changed(self, node: Node, before: Health) -> None:
+        """Identify a node that has come online for the first time. One that was offline may have restarted meanwhile."""
+        if OFFLINE in (node.health, before):
+            self.restarted(node)
+        if node.health is not ONLINE:
+            return
+        now, record = self._parts.clock(), self._parts.on(node)[0]
+        if record.identity is None and now >= record.identify_after:
+            record.identify_after = now + PAUSE
+            self._queue(node, self._parts.driver.identify(record.name), partial(self._identified, record))
 
-        plan = self._bus.driver.identify(record.name)
-        self._bus.scheduler.requests.put(Job(Callback(introduced), now + PATIENCE, plan=plan, node=node.id))
+    def restarted(self, node: Node) -> None:
+        """Find out what became of a changed id or baud rate that waited for the restart of this node."""
+        commissioning = self._parts.driver.commissioning
+        plan = None if commissioning is None else commissioning.restarted(node.id)
+        if plan is not None:
+            self._queue(node, plan, _ignore)
+
+    def _queue(self, node: Node, plan: Plan[Any], done: Callable[[Any], None]) -> None:
+        """Queue a plan of ours. It is never refused: this is called in the middle of the node's fence, by no caller's request."""
+        expires = self._parts.clock() + PATIENCE
+        self._parts.scheduler.queue_own(Job(Callback(done), expires, plan=plan, node=node.id, even_if_offline=True))
+
+
+def _ignore(_: object) -> None:
+    pass

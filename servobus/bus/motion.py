@@ -1,6 +1,14 @@
-"""Everything that moves on one bus: goals, enable, disable, e-stop, and what is left behind at the end.
+"""Everything that moves on one bus: goals, enable, disable, e-stop, and what is left behind at exit.
 
 Refusals come first and cost no byte. What an e-stop or a restart has ended is never sent again.
+
+How `_stop` works, for an e-stop, a limp and a lost client alike:
+
+1. Records of servos that go limp are disabled before anything is sent, so that no goal can follow the torque off.
+2. Nodes that are online are asked before the others: a dead servo must not hold up a live one.
+3. A servo holds at its present position where that is fresh, else the driver reads it first.
+4. The report says for each servo what was written and what was confirmed by reading it back. An error of the whole stop
+   (the line is down) becomes a report for each servo.
 """
 
 from __future__ import annotations
@@ -8,240 +16,269 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from servobus.bus.limits import check_goal
 from servobus.bus.records import ServoRecord
+from servobus.bus.requests import BusParts, Requests
 from servobus.engine.coalescer import Ticket
-from servobus.engine.health import Condition, Node
-from servobus.engine.queue import Job
+from servobus.engine.health import OFFLINE, ONLINE, Node
+from servobus.engine.job import Job, JobKind
+from servobus.engine.stats import Counter
 from servobus.errors import Busy, DeviceError, EStopped, LeaseHeld, LinkDown, NotEnabled, ServobusError, SettleTimeout
-from servobus.values import Goal, Outcome, ServoGoal, State, StopReport, StopTarget
+from servobus.values import EventName, Goal, Identity, Outcome, ServoGoal, State, StopReport, StopTarget
 
-if TYPE_CHECKING:
-    from servobus.bus.service import BusService
-
-MIN_TTL = 0.2
+MIN_START_WITHIN = 0.2
 """Seconds a goal may wait for its first byte, unless two learned turns take longer."""
 FRESH = 0.1
 """Seconds for which a position is good enough to be held at once by an e-stop."""
 SESSION = "a scan or commissioning session has this bus: wait until it ends"
 SETTLE_PERIOD = 0.02
+TOLERANCE_STEPS = 10
 _batches = itertools.count(1)
 
 
 class Motion:
     """Goals and stops of one bus."""
 
-    def __init__(self, bus: BusService) -> None:
-        self._bus = bus
+    def __init__(
+        self,
+        parts: BusParts,
+        requests: Requests,
+        *,
+        identify: Callable[[str], Awaitable[Identity]],
+        read: Callable[[str, float | None], Awaitable[State]],
+    ) -> None:
+        self._parts = parts
+        self._requests = requests
+        self._identify = identify
+        self._read = read
+        self._loop = asyncio.get_running_loop()
         self.latched = False
         """The e-stop holds: motion and enable are refused until it is cleared."""
         self.leaving = False
-        """The rig is being left: nothing new is begun."""
+        """The rig is being left: nothing new begins."""
         self.enabling: set[str] = set()
-        """Servos that are being enabled just now."""
+        """Servos whose enable is under way."""
+
+    def refuse(self) -> None:
+        """Raise what refuses all motion on this bus now: EStopped, Busy, NotEnabled."""
+        if self.latched:
+            raise EStopped("the e-stop is latched: `clear` releases it", bus=self._parts.name)
+        if self._parts.scheduler.session is not None:
+            raise Busy(SESSION, bus=self._parts.name)
+        if self.leaving:
+            message = "the rig is being left: its servos stop as their on_exit says, nothing was sent"
+            raise NotEnabled(message, bus=self._parts.name)
+
+    # Goals
 
     def check(self, goals: Mapping[str, Goal]) -> dict[str, Goal]:
-        """The goals to send, clamped where a servo says so. Raises what refuses any of them; nothing is sent."""
+        """Return the goals to send, clamped where a servo says so. Raises what refuses any of them; nothing is sent."""
         self.refuse()
-        checked = {}
-        for servo, goal in goals.items():
-            record = self._bus.records[servo]
-            if not record.enabled:
-                raise NotEnabled("the servo is not enabled: enable it first", bus=self._bus.name, servo=servo)
-            try:
-                checked[servo] = check_goal(servo, goal, record.options, record.reference())
-                self._bus.driver.check_goal(ServoGoal(servo, checked[servo], record.reference()))
-            except ServobusError as error:
-                raise error.at(bus=self._bus.name) from None
-            if checked[servo] != goal:
-                self._bus.stats.counts["goals_clamped"] += 1
-                self._bus.event("goal_clamped", bus=self._bus.name, servo=servo, asked=goal.value, applied=checked[servo].value)
+        return {servo: self._check(self._parts.records[servo], goal) for servo, goal in goals.items()}
+
+    def _check(self, record: ServoRecord, goal: Goal) -> Goal:
+        parts = self._parts
+        if not record.enabled:
+            raise NotEnabled("the servo is not enabled: enable it first", bus=parts.name, servo=record.name)
+        try:
+            checked = check_goal(record.name, goal, record.options, record.reference())
+            parts.driver.check_goal(ServoGoal(record.name, checked, record.reference()))
+        except ServobusError as error:
+            raise error.at(bus=parts.name) from None
+        if checked != goal:
+            parts.stats.counts[Counter.GOALS_CLAMPED] += 1
+            parts.emit(EventName.GOAL_CLAMPED, bus=parts.name, servo=record.name, asked=goal.value, applied=checked.value)
         return checked
 
     def put(self, goals: Mapping[str, Goal], *, together: bool, confirm: bool) -> dict[str, asyncio.Future[Outcome]]:
-        """Checked goals on their way; each future ends with its outcome or its error."""
-        bus = self._bus
+        """Send checked goals; each future ends with its outcome or its error."""
+        parts = self._parts
         batch = next(_batches) if together else None
         futures = {}
         for servo, goal in goals.items():
-            future: asyncio.Future[Outcome] = bus.loop.create_future()
-            ticket = self._ticket(bus.records[servo], goal, future)
+            future: asyncio.Future[Outcome] = self._loop.create_future()
+            record = parts.records[servo]
+            ticket = self._ticket(record, goal, future)
             ticket.batch, ticket.confirm, ticket.gone = batch, confirm, future.cancelled
-            bus.stats.counts["goals"] += 1
-            self._pace(ticket)
-            bus.scheduler.coalescer.put(ticket)
+            parts.stats.counts[Counter.GOALS] += 1
+            speed = parts.driver.host_speed(ticket.goal)
+            start = record.setpoint if record.ramped else ticket.goal.start
+            record.ramped = speed is not None
+            parts.scheduler.put_goal(ticket, parts.clock(), speed=speed, start=start)
             futures[servo] = future
-        if bus.master.up:
-            bus.master.goals_waiting()
-        else:
-            bus.scheduler.coalescer.drop(lambda servo: LinkDown("the line is down: nothing was sent", bus=bus.name, servo=servo))
+        if not parts.master.up:
+            parts.scheduler.drop_goals(lambda servo: LinkDown("the line is down: nothing was sent", bus=parts.name, servo=servo))
         return futures
 
-    def _pace(self, ticket: Ticket) -> None:
-        """Where the servo keeps no speed, the host does; any way it was being led on ends."""
-        profile, speed = self._bus.scheduler.profile, self._bus.driver.host_speed(ticket.goal)
-        if speed is None:
-            profile.drop({ticket.servo})
-        else:
-            profile.begin(ticket, speed, self._bus.clock())
-
     def _ticket(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome]) -> Ticket:
-        now = self._bus.clock()
-        patience = 2 * (record.node.deadline + self._bus.line.traits.latency)
-        ttl = goal.start_within or record.options.ttl or max(MIN_TTL, patience)
+        now = self._parts.clock()
+        two_turns = 2 * (record.node.reply_allowance_s + self._parts.line.traits.latency)
+        start_within = goal.start_within or record.options.ttl or max(MIN_START_WITHIN, two_turns)
         position = record.position(now, FRESH)
         start = record.reference() if position is None else position
-        return Ticket(ServoGoal(record.name, goal, start), record.node.id, now + ttl, partial(self._settle, record, goal, future))
+        done = partial(self._ended, record, goal, future)
+        return Ticket(ServoGoal(record.name, goal, start), record.node.id, now + start_within, done)
 
-    def _settle(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome], result: Outcome | Exception) -> None:
+    def _ended(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome], result: Outcome | Exception) -> None:
         """A ticket has ended."""
-        counts = self._bus.stats.counts
+        counts = self._parts.stats.counts
         if isinstance(result, Outcome):
+            counts[OUTCOME_COUNTERS[result]] += 1
             if result is not Outcome.SUPERSEDED and goal.kind == "position":
-                record.setpoint = goal.value
-            counts[f"goals_{result}"] += 1
+                record.goal = goal.value
+                if not record.ramped:
+                    record.setpoint = goal.value
             if not future.done():
                 future.set_result(result)
             return
-        counts["goals_failed"] += 1
+        counts[Counter.GOALS_FAILED] += 1
         if not future.done():
-            future.set_exception(
-                result.at(bus=self._bus.name, servo=record.name) if isinstance(result, ServobusError) else result
-            )
+            error = result.at(bus=self._parts.name, servo=record.name) if isinstance(result, ServobusError) else result
+            future.set_exception(error)
+
+    def setpoint_sent(self, servo: str, setpoint: float) -> None:
+        """The host's ramp of this servo has gone on to this setpoint."""
+        record = self._parts.records[servo]
+        if record.ramped:
+            record.setpoint = setpoint
+
+    # Enable and disable
 
     async def enable(self, servo: str) -> None:
+        """Set the goal to the present position, then switch torque on. Raises EStopped, Busy, NotEnabled, DeviceError."""
         self.refuse()
-        record = self._bus.records[servo]
+        record = self._parts.records[servo]
         generation = record.generation
         self.enabling.add(servo)
         try:
             if record.identity is None:
-                await self._bus.identify(servo)
+                await self._identify(servo)
                 self.refuse()
-            self._set_enabled(record, False)
+            record.enabled = False
             record.touched = True  # also when this is cancelled or fails half-way
-            present = await self._bus.perform(self._bus.driver.enable(servo), record.node.id, servo=servo, motion=True)
+            plan = self._parts.driver.enable(servo)
+            present = await self._requests.perform(plan, record.node.id, servo=servo, kind=JobKind.MOTION)
         finally:
             self.enabling.discard(servo)
         if self.latched or self.leaving:
-            raise EStopped("the e-stop came while it was being enabled", bus=self._bus.name, servo=servo)
+            raise EStopped("the e-stop came while the servo was being enabled", bus=self._parts.name, servo=servo)
         if record.generation != generation:
-            raise NotEnabled("it was disabled while it was being enabled", bus=self._bus.name, servo=servo)
-        record.setpoint = present
-        self._bus.scheduler.profile.forget(servo)
-        self._set_enabled(record, True)
+            raise NotEnabled("the servo was disabled while it was being enabled", bus=self._parts.name, servo=servo)
+        record.hold_at(present)
+        self._parts.scheduler.ramps.drop({servo})
+        record.enabled = True
 
     async def disable(self, servo: str) -> None:
-        record = self._bus.records[servo]
-        if self._bus.scheduler.session is not None:
-            raise Busy(SESSION, bus=self._bus.name, servo=servo)
-        self._bus.scheduler.drop_goals(self._disabled, {servo})
-        self._disable(record)
-        report = await self._bus.perform(self._bus.driver.disable(servo), record.node.id, servo=servo, urgent=True)
+        """Switch torque off and read it back. Raises Busy in an exclusive session, DeviceError where it is not confirmed."""
+        record = self._parts.records[servo]
+        if self._parts.scheduler.session is not None:
+            raise Busy(SESSION, bus=self._parts.name, servo=servo)
+        self._parts.scheduler.drop_goals(self._disabled, {servo})
+        _disable(record)
+        plan = self._parts.driver.disable(servo)
+        report = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True)
         if not report.confirmed:
-            raise DeviceError(f"torque off was written and not confirmed: {report.detail}", bus=self._bus.name, servo=servo)
-        self._disable(record)
+            message = f"torque off was written and not confirmed: {report.detail}"
+            raise DeviceError(message, bus=self._parts.name, servo=servo)
+        _disable(record)
         record.touched = False
 
+    def disable_restarted(self, node: Node) -> list[ServoRecord]:
+        """Disable the servos of a node that lost what `enable` wrote; return those that were enabled."""
+        records = self._parts.on(node)
+        restarted = [record for record in records if record.enabled]
+        for record in restarted:
+            record.hold_at(None)
+            record.enabled = False
+        self._parts.scheduler.drop_goals(self._disabled, {record.name for record in records})
+        return restarted
+
+    def _disabled(self, servo: str) -> ServobusError:
+        return NotEnabled("the servo was disabled before this goal could leave", bus=self._parts.name, servo=servo)
+
+    # Stops
+
     async def stop(self) -> dict[str, StopReport]:
-        """E-stop for this bus: everything that moves is dropped, every servo stops as its `on_estop` says (park: holds first)."""
+        """E-stop this bus: drop everything that moves, stop every servo as its `on_estop` says (park: holds first)."""
         self.latched = True
-        return await self._stop(lambda record: record.options.on_estop, list(self._bus.records.values()), estop=True)
+        return await self._stop(lambda record: record.options.on_estop, list(self._parts.records.values()), JobKind.ESTOP)
 
     async def limp(self, servos: Sequence[str]) -> dict[str, StopReport]:
-        """Torque off for these, ahead of everything that waits."""
-        records = [self._bus.records[servo] for servo in servos]
-        return await self._stop(lambda _: "limp", records, estop=self.latched or self.leaving)
+        """Switch torque off for these servos, ahead of everything that waits."""
+        records = [self._parts.records[servo] for servo in servos]
+        kind = JobKind.ESTOP if self.latched or self.leaving else JobKind.MOTION
+        return await self._stop(lambda _: "limp", records, kind)
 
     async def abandon(self, servos: Collection[str]) -> dict[str, StopReport]:
-        """Whoever moved these is gone: those that are enabled stop as their `on_lost_client` says (park: hold first), between two
-        plans of the others."""
-        gone = LeaseHeld("the client that moved it is gone: nothing was sent")
-        self._bus.scheduler.drop_goals(lambda servo: gone.at(bus=self._bus.name, servo=servo), servos)
-        records = [self._bus.records[servo] for servo in servos if self._bus.records[servo].enabled]
-        return await self._stop(lambda record: record.options.on_lost_client, records, estop=False)
+        """Stop the enabled servos of a client that is gone as their `on_lost_client` says (park: hold first).
+
+        The stop comes between two plans of other clients.
+        """
+        gone = LeaseHeld("the client that moved the servo is gone: nothing was sent")
+        self._parts.scheduler.drop_goals(lambda servo: gone.at(bus=self._parts.name, servo=servo), servos)
+        records = [self._parts.records[servo] for servo in servos if self._parts.records[servo].enabled]
+        return await self._stop(lambda record: record.options.on_lost_client, records, JobKind.MOTION)
+
+    async def leave(self) -> dict[str, StopReport]:
+        """Stop each servo whose torque may be on because of us as its `on_exit` says; park is the rig's."""
+        return await self._stop(lambda record: record.options.on_exit, self.to_leave(), JobKind.ESTOP)
+
+    def to_leave(self) -> list[ServoRecord]:
+        """Return the servos whose torque may be on because of us."""
+        return [record for record in self._parts.records.values() if record.touched]
 
     async def _stop(
-        self, kind_of: Callable[[ServoRecord], str], servos: Sequence[ServoRecord], *, estop: bool
+        self, action_of: Callable[[ServoRecord], str], servos: Sequence[ServoRecord], kind: JobKind
     ) -> dict[str, StopReport]:
-        now = self._bus.clock()
-        # Those that answer come first: a dead one must not hold up a live one.
-        records = sorted(servos, key=lambda record: record.node.condition is not Condition.ONLINE)
-        targets = [
-            StopTarget(
-                record.name,
-                "limp" if kind_of(record) == "limp" else "hold",
-                enabled=record.enabled,
-                position=record.position(now, FRESH),
-                reachable=record.node.condition is not Condition.OFFLINE,
-            )
-            for record in records
-        ]
-        if not targets:
+        if not servos:
             return {}
-        future: asyncio.Future[dict[str, StopReport]] = self._bus.loop.create_future()
-        job = Job(future, math.inf, plan=self._bus.driver.stop(targets), node=records[0].node.id, tries=1, motion=not estop)
-        for record, target in zip(records, targets, strict=True):
-            record.setpoint = None
-            if target.kind == "limp":
-                self._disable(record)  # before anything is said: no goal may leave behind the torque off
+        records = sorted(servos, key=lambda record: record.node.health is not ONLINE)
+        targets = [self._stop_target(record, action_of(record)) for record in records]
+        limp = [record for record, target in zip(records, targets, strict=True) if target.kind == "limp"]
+        plan = self._parts.driver.stop(targets)
+        future: asyncio.Future[dict[str, StopReport]] = self._loop.create_future()
+        job = Job(future, math.inf, plan=plan, node=records[0].node.id, kind=kind, tries=1)
+        for record in records:
+            record.hold_at(None)
+        for record in limp:
+            _disable(record)
         try:
-            self._bus.master.submit_stop(job, estop=estop)
+            self._parts.master.submit_stop(job)
             reports = await future
         except ServobusError as error:
             if not future.done():
                 job.fail(error)
                 future.exception()
             reports = {target.servo: StopReport(target.kind, False, False, str(error)) for target in targets}
-        for record, target in zip(records, targets, strict=True):
-            if target.kind == "limp":
-                record.touched = record.touched and not reports[record.name].confirmed
+        for record in limp:
+            record.touched = record.touched and not reports[record.name].confirmed
         return {record.name: reports[record.name] for record in servos}
 
-    async def settle(self, servo: str, *, tolerance: float | None, timeout: float, parking: bool = False) -> State:
-        """Until it stands at its setpoint. Raises SettleTimeout; EStopped and NotEnabled when it will not get there any more."""
-        bus, record = self._bus, self._bus.records[servo]
-        moving = record.enabled
-        near = bus.tolerance(servo) if tolerance is None else tolerance
-        end = bus.clock() + timeout
-        while True:
-            self._refuse_to_settle(record, moving, parking)
-            state = await bus.read(servo, SETTLE_PERIOD)
-            self._refuse_to_settle(record, moving, parking)  # a stop or a restart meanwhile has changed its setpoint
-            there = record.setpoint is None or (state.position is not None and abs(state.position - record.setpoint) <= near)
-            if there and not state.moving and not bus.scheduler.profile.leads(servo):
-                return state
-            if bus.clock() >= end:
-                raise SettleTimeout(
-                    f"it did not settle within {timeout:g} s: it stands at {state.position}, its goal is {record.setpoint}",
-                    bus=bus.name,
-                    servo=servo,
-                )
-            await asyncio.sleep(SETTLE_PERIOD)
-
-    def _refuse_to_settle(self, record: ServoRecord, moving: bool, parking: bool) -> None:
-        if self.latched and not parking:
-            raise EStopped("the e-stop came before it stood at its goal", bus=self._bus.name, servo=record.name)
-        if moving and not record.enabled:
-            raise NotEnabled(
-                "it was disabled, or has restarted, before it stood at its goal", bus=self._bus.name, servo=record.name
-            )
+    def _stop_target(self, record: ServoRecord, action: str) -> StopTarget:
+        return StopTarget(
+            record.name,
+            "limp" if action == "limp" else "hold",
+            enabled=record.enabled,
+            position=record.position(self._parts.clock(), FRESH),
+            setpoint=record.setpoint,
+            reachable=record.node.health is not OFFLINE,
+        )
 
     async def park(self, servo: str) -> StopReport:
-        """To the park pose within `park_timeout`, then limp, even if it does not get there. The e-stop it serves lets it pass."""
-        record = self._bus.records[servo]
+        """Go to the park pose within `park_timeout`, then go limp, even if the pose was not reached. Allowed while latched."""
+        record = self._parts.records[servo]
         options = record.options
         detail = ""
         try:
-            # Whether it still is as we left it: one that has restarted is limp, and must not be moved.
-            await self._bus.perform(self._bus.scheduler.recovery(record.node), record.node.id, servo=servo, urgent=True)
+            # A servo that has restarted is limp, and must not be moved: the fence finds out.
+            fence = self._parts.scheduler.fence(record.node)
+            await self._requests.perform(fence, record.node.id, servo=servo, even_if_offline=True)
             if not record.enabled:
-                return StopReport("none", False, True, "it was disabled, or has restarted")
+                return StopReport("none", False, True, "the servo was disabled, or has restarted")
             assert options.park_pose is not None
             goal = Goal("position", options.park_pose)
             await self.put({servo: goal}, together=False, confirm=False)[servo]
@@ -249,41 +286,50 @@ class Motion:
         except ServobusError as error:
             detail = f"not at its park pose: {error.message}"
         report = (await self.limp([servo]))[servo]
-        self._bus.records[servo].touched = False  # its report tells; a hold on the way out would only stiffen what should be limp
+        record.touched = False  # the report tells; a hold at exit would only stiffen what should be limp
         return replace(report, action="park", confirmed=report.confirmed and not detail, detail=detail or report.detail)
 
-    def refuse(self) -> None:
-        if self.latched:
-            raise EStopped("the e-stop is latched: `clear` releases it", bus=self._bus.name)
-        if self._bus.scheduler.session is not None:
-            raise Busy(SESSION, bus=self._bus.name)
-        if self.leaving:
-            raise NotEnabled("the rig is being left: its servos stop as their on_exit says, nothing was sent", bus=self._bus.name)
+    # Arrival
 
-    def disable_restarted(self, node: Node) -> list[ServoRecord]:
-        """The node has lost what enable() wrote: its servos that were enabled, now disabled."""
-        restarted = [record for record in self._bus.on(node) if record.enabled]
-        for record in restarted:
-            record.setpoint = None
-            self._set_enabled(record, False)
-        self._bus.scheduler.drop_goals(self._disabled, {record.name for record in self._bus.on(node)})
-        return restarted
+    async def settle(self, servo: str, *, tolerance: float | None, timeout: float, parking: bool = False) -> State:
+        """Wait until the servo rests at its goal. `tolerance` in its unit, `timeout` in seconds.
 
-    async def leave(self) -> dict[str, StopReport]:
-        """What `on_exit` says, hold and limp, for each servo whose torque may be on because of us; park is the rig's."""
-        return await self._stop(lambda record: record.options.on_exit, self.to_leave(), estop=True)
+        Raises SettleTimeout with its position, EStopped and NotEnabled when it cannot arrive any more.
+        """
+        parts, record = self._parts, self._parts.records[servo]
+        moving = record.enabled
+        near = TOLERANCE_STEPS * parts.driver.step(servo) if tolerance is None else tolerance
+        end = parts.clock() + timeout
+        while True:
+            self._refuse_to_settle(record, moving, parking)
+            state = await self._read(servo, SETTLE_PERIOD)
+            self._refuse_to_settle(record, moving, parking)  # a stop or a restart meanwhile has changed its goal
+            there = record.goal is None or (state.position is not None and abs(state.position - record.goal) <= near)
+            if there and not state.moving and servo not in parts.scheduler.ramps.active:
+                return state
+            if parts.clock() >= end:
+                raise SettleTimeout(
+                    f"the servo did not settle within {timeout:g} s: it is at {state.position}, its goal is {record.goal}",
+                    bus=parts.name,
+                    servo=servo,
+                )
+            await asyncio.sleep(SETTLE_PERIOD)
 
-    def to_leave(self) -> list[ServoRecord]:
-        """The servos whose torque may be on because of us."""
-        return [record for record in self._bus.records.values() if record.touched]
+    def _refuse_to_settle(self, record: ServoRecord, moving: bool, parking: bool) -> None:
+        if self.latched and not parking:
+            raise EStopped("the e-stop came before the servo arrived at its goal", bus=self._parts.name, servo=record.name)
+        if moving and not record.enabled:
+            message = "the servo was disabled, or has restarted, before it arrived at its goal"
+            raise NotEnabled(message, bus=self._parts.name, servo=record.name)
 
-    def _disable(self, record: ServoRecord) -> None:
-        record.generation += 1
-        self._set_enabled(record, False)
 
-    def _set_enabled(self, record: ServoRecord, enabled: bool) -> None:
-        record.enabled = enabled
-        record.node.enabled = tuple(other.name for other in self._bus.on(record.node) if other.enabled)
+OUTCOME_COUNTERS = {
+    Outcome.ACKED: Counter.GOALS_ACKED,
+    Outcome.SENT: Counter.GOALS_SENT,
+    Outcome.SUPERSEDED: Counter.GOALS_SUPERSEDED,
+}
 
-    def _disabled(self, servo: str) -> ServobusError:
-        return NotEnabled("the servo was disabled before this goal could leave", bus=self._bus.name, servo=servo)
+
+def _disable(record: ServoRecord) -> None:
+    record.generation += 1
+    record.enabled = False

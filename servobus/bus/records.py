@@ -1,4 +1,4 @@
-"""What the service remembers of one servo between two turns."""
+"""What servobus keeps of one servo between two turns. Pure."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ from typing import Any
 
 from servobus.engine.health import Node
 from servobus.protocols.options import ServoOptions
-from servobus.values import Health, Identity, State, Update
+from servobus.values import Identity, State, Update
 
 
 class ServoRecord:
-    """Host-side state of a servo. Fields of State come from replies; `enabled` is our own doing."""
+    """Host-side state of a servo. Fields of `State` come from replies; `enabled`, `goal` and `setpoint` are our own doing."""
 
     __slots__ = (
         "_fields",
         "enabled",
         "generation",
+        "goal",
         "identify_after",
         "identity",
         "name",
         "node",
         "options",
         "position_at",
+        "ramped",
         "setpoint",
         "touched",
         "updated_at",
@@ -35,12 +37,16 @@ class ServoRecord:
         self.generation = 0
         """Counts what ends an enable that is under way: disable, limp."""
         self.touched = False
-        """We may have switched its torque on, even if enable() did not come through: at the end it is left as `on_exit` says."""
+        """We may have switched its torque on, even if `enable` failed half-way: at exit it is left as `on_exit` says."""
         self.identity: Identity | None = None
         self.identify_after = 0.0
-        """Not before this is an unknown servo asked again who it is."""
-        self.setpoint: float | None = None
+        """Before this time a servo that could not be identified is not asked again."""
+        self.goal: float | None = None
         """The last position asked for, or held."""
+        self.setpoint: float | None = None
+        """The last position sent, or held: behind `goal` while the host ramps the servo."""
+        self.ramped = False
+        """The setpoint is one of a ramp."""
         self.position_at: float | None = None
         self.updated_at: float | None = None
         self._fields: dict[str, Any] = {}
@@ -51,30 +57,33 @@ class ServoRecord:
         if "position" in fields:
             self.position_at = now
 
+    def hold_at(self, position: float | None) -> None:
+        """Note that the servo holds this position; None: it is not known where."""
+        self.goal = self.setpoint = position
+        self.ramped = False
+
     def position(self, now: float, max_age: float) -> float | None:
-        """The last position heard, if it is fresh enough."""
+        """Return the last position read, if it is fresh enough."""
         if self.position_at is None or now - self.position_at > max_age:
             return None
         position: float | None = self._fields.get("position")
         return position
 
     def reference(self) -> float | None:
-        """Where a step is counted from: the last setpoint, else the last position heard."""
-        return self.setpoint if self.setpoint is not None else self._fields.get("position")
+        """Return where a step is counted from: the last goal, else the last position read."""
+        return self.goal if self.goal is not None else self._fields.get("position")
 
     def state(self, now: float, faults: tuple[str, ...]) -> State:
         fields = dict(self._fields)
-        status = fields.pop("status", None) if self.node.status is None else self.node.status
-        fields.pop("status", None)
-        goal = fields.pop("goal", None) if self.setpoint is None else self.setpoint
-        fields.pop("goal", None)
+        status = fields.pop("status", None)
+        goal = fields.pop("goal", None)
         return State(
             **fields,
-            goal=goal,
+            goal=goal if self.goal is None else self.goal,
             enabled=self.enabled,
             faults=faults,
-            status=status,
-            health=Health(self.node.condition.value),
+            status=status if self.node.status is None else self.node.status,
+            health=self.node.health,
             time=self.updated_at,
             age=None if self.updated_at is None else now - self.updated_at,
         )

@@ -1,14 +1,12 @@
-"""Looks for servos: every id, one after the other (the seed forbids broadcast questions on a line of several), at every rate."""
+"""Scans a line for servos: every id at every rate, one request at a time (broadcast questions are for a single servo only)."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Sequence
-from typing import TYPE_CHECKING
 
+from servobus.bus.service import BusService
+from servobus.engine.stats import Counter
 from servobus.errors import DeviceError, NotSupported, ReplyTimeout
-
-if TYPE_CHECKING:
-    from servobus.bus.service import BusService
 
 Hit = tuple[int, int, str | None, str | None, str | None, str]
 """Id, baud rate, model, product, firmware, note."""
@@ -17,8 +15,10 @@ Hit = tuple[int, int, str | None, str | None, str | None, str]
 async def scan(
     bus: BusService, baudrates: Sequence[int], ids: Sequence[int]
 ) -> AsyncGenerator[tuple[int, int, Hit | None], None]:
-    """Yields (asked so far, in all, what was found). The bus's own rate is restored whatever happens. Raises NotSupported,
-    LeaseHeld, LinkDown."""
+    """Yield (ids asked so far, ids in all, hit or None) for each id.
+
+    The bus's own rate is restored whatever happens. Raises NotSupported, Busy, LinkDown.
+    """
     own = bus.options.baudrate
     if any(rate != own for rate in baudrates) and not bus.line.traits.can_change_baud:
         raise NotSupported("this line cannot change its baud rate: scan at its own", bus=bus.name)
@@ -28,29 +28,29 @@ async def scan(
             for rate in baudrates:
                 bus.set_baudrate(rate)
                 for node in ids:
-                    hit = await _look(bus, node, rate, session)
+                    hit = await _ask(bus, node, rate, session)
                     asked += 1
                     yield asked, count, hit
         finally:
             bus.set_baudrate(own)
 
 
-async def _look(bus: BusService, node: int, rate: int, session: object) -> Hit | None:
-    question = bus.driver.ping(node)
-    echoes = bus.stats.counts["echoes"]
+async def _ask(bus: BusService, node: int, rate: int, session: object) -> Hit | None:
+    request = bus.driver.ping(node)
+    echoes = bus.stats.counts[Counter.ECHOES]
     try:
-        await bus.ask(question, urgent=True, session=session, tries=1)
+        await bus.ask(request, even_if_offline=True, session=session, tries=1)
     except ReplyTimeout:
-        plain = question.plain()
-        if plain is None or bus.stats.counts["echoes"] == echoes:
+        plain = request.plain()
+        if plain is None or bus.stats.counts[Counter.ECHOES] == echoes:
             return None
-        # What came looked like the question: an echo, or a servo whose fault makes its answer look so. Ask so that they differ.
+        # A frame like the request came back: its echo, or a servo whose fault makes its reply look so. Ask so that they differ.
         try:
-            await bus.ask(plain, urgent=True, session=session, tries=1)
+            await bus.ask(plain, even_if_offline=True, session=session, tries=1)
         except ReplyTimeout:
             return None
     try:
-        seen = await bus.perform(bus.driver.inspect(node), node, urgent=True, session=session)
+        identity = await bus.perform(bus.driver.inspect(node), node, even_if_offline=True, session=session)
     except (ReplyTimeout, DeviceError):
         return node, rate, None, None, None, "answers, but not who it is: two servos with this id?"
-    return node, rate, seen.model, seen.product, seen.firmware, "; ".join(seen.notes)
+    return node, rate, identity.model, identity.product, identity.firmware, "; ".join(identity.notes)

@@ -14,6 +14,7 @@ from servobus.daemon.notify import Notifier
 from servobus.daemon.server import NativeDoor, open_door
 from servobus.daemon.sockets import claim
 from servobus.daemon.watchdog import Pulse, Watchdog
+from servobus.engine.stats import Counter
 from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig
 from servobus.rig.logs import EventLogger
@@ -77,7 +78,7 @@ async def _feed(rig: LocalRig, notifier: Notifier, period: float) -> None:
 def _pulse(rig: LocalRig, name: str) -> Pulse:
     bus = rig.buses[name]
     counts = bus.stats.counts
-    return Pulse(bus.master.up, counts["frames"], counts["bytes_heard"], bus.scheduler.waiting())
+    return Pulse(bus.master.up, counts[Counter.FRAMES], counts[Counter.BYTES_RECEIVED], bus.scheduler.waiting())
 
 
 async def _log_states(rig: LocalRig, every: float) -> None:

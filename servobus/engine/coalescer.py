@@ -1,9 +1,9 @@
-"""Keeps the latest goal of each servo and hands them out as groups. Pure: the time is given.
+"""Keeps the latest goal of each servo and hands goals out as groups. Pure: it is given the time.
 
-A newer goal replaces the older one of the same servo wherever that one stood; a goal whose time to live has passed is
-dropped, never replayed. Goals that were asked for together leave together or not at all: when one of them is dropped
-(expired, disabled, its caller gone), the others are too. A newer goal for one of them drops nothing: that servo has
-what its caller wanted last, and the others still leave in one turn.
+A newer goal replaces the older one of the same servo wherever that one waits. A goal whose time has passed is dropped,
+never sent later. Goals that were asked for together leave together or not at all: when one of them is dropped (expired,
+disabled, its caller gone), the others are too. A newer goal for one of them drops nothing: that servo gets what its
+caller wanted last, and the others still leave in one plan.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def _never() -> bool:
 
 def _expired(servo: str) -> ServobusError:
     return GoalExpired(
-        "its time to live passed before its first byte could leave: the line or the servo is busy or gone", servo=servo
+        "the goal expired before its first byte could leave: the line or the servo is busy or gone; retry later", servo=servo
     )
 
 
@@ -37,7 +37,7 @@ class Ticket:
     """Tickets with the same batch leave together."""
     confirm: bool = False
     gone: Callable[[], bool] = _never
-    """Whether its caller has left: then it is dropped, and nobody is told."""
+    """Returns whether its caller has left: then the goal is dropped without a result."""
 
     @property
     def servo(self) -> str:
@@ -46,7 +46,7 @@ class Ticket:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Goals that shall leave now."""
+    """Goals that leave now."""
 
     tickets: Sequence[Ticket]
     together: bool
@@ -54,69 +54,73 @@ class Group:
 
 
 class Coalescer:
-    """At most one ticket a servo, so it is bounded by the config."""
+    """Holds at most one ticket a servo, so the config bounds it."""
+
+    __slots__ = ("tickets",)
 
     def __init__(self) -> None:
-        self._tickets: dict[str, Ticket] = {}
+        self.tickets: dict[str, Ticket] = {}
 
     def __len__(self) -> int:
-        return len(self._tickets)
+        return len(self.tickets)
 
     def put(self, ticket: Ticket) -> None:
-        """The newest goal of its servo; the older one ends as SUPERSEDED."""
-        older = self._tickets.get(ticket.servo)
-        self._tickets[ticket.servo] = ticket
+        """Take the newest goal of its servo; the older one ends as SUPERSEDED."""
+        servo = ticket.goal.servo
+        older = self.tickets.get(servo)
+        self.tickets[servo] = ticket
         if older is not None:
             older.done(Outcome.SUPERSEDED)
 
     def put_back(self, ticket: Ticket) -> None:
-        """It was taken and could not leave: it waits again, unless a newer goal has come."""
-        if ticket.servo in self._tickets:
+        """Take back a goal that could not leave: it waits again, unless a newer goal has come."""
+        if ticket.servo in self.tickets:
             ticket.done(Outcome.SUPERSEDED)
         else:
-            self._tickets[ticket.servo] = ticket
+            self.tickets[ticket.servo] = ticket
 
     def take(self, now: float, ready: Collection[int]) -> Group | None:
-        """The next group whose nodes are all ready. Expired goals, and those nobody waits for, are dropped on the way."""
+        """Return the next group whose nodes are all ready. Goals that expired or whose caller has left are dropped first."""
         self.expire(now)
-        for first in self._tickets.values():
-            members = self._mates(first, ready)
+        for first in self.tickets.values():
+            members = self._group_of(first, ready)
             if members:
                 for ticket in members:
-                    del self._tickets[ticket.servo]
+                    del self.tickets[ticket.servo]
                 return Group(members, first.batch is not None, first.confirm)
         return None
 
     def expire(self, now: float) -> None:
-        """End what is too old (at the very moment it expires) or waited for by nobody, and its group with it."""
-        late = [ticket for ticket in self._tickets.values() if ticket.expires <= now or ticket.gone()]
+        """End the goals that expire by now or whose caller has left, and the groups they belong to."""
+        late = [ticket for ticket in self.tickets.values() if ticket.expires <= now or ticket.gone()]
         if late:
             self._end(late, _expired)
 
     def next_expiry(self) -> float | None:
-        return min((ticket.expires for ticket in self._tickets.values()), default=None)
+        return min((ticket.expires for ticket in self.tickets.values()), default=None)
 
     def drop(self, error: Callable[[str], ServobusError], servos: Collection[str] | None = None) -> None:
         """End all goals, or those of some servos and of their groups, with an error."""
-        self._end([ticket for ticket in self._tickets.values() if servos is None or ticket.servo in servos], error)
+        self._end([ticket for ticket in self.tickets.values() if servos is None or ticket.servo in servos], error)
 
     def _end(self, ended: Sequence[Ticket], error: Callable[[str], ServobusError]) -> None:
-        """These end with the error; those asked for together with one of them are withheld."""
+        """End these tickets with the error; withhold those that were asked for together with one of them."""
         batches = {ticket.batch for ticket in ended if ticket.batch is not None}
-        mates = [ticket for ticket in self._tickets.values() if ticket.batch in batches and ticket not in ended]
+        mates = [ticket for ticket in self.tickets.values() if ticket.batch in batches and ticket not in ended]
         for ticket in (*ended, *mates):
-            del self._tickets[ticket.servo]
+            del self.tickets[ticket.servo]
         names = ", ".join(ticket.servo for ticket in ended)
         for ticket in ended:
             if not ticket.gone():
                 ticket.done(error(ticket.servo))
-        reason = f"it was asked for together with {names}, which was dropped before it could leave: nothing was sent"
+        reason = f"the goal was asked for together with {names}, which was dropped before it could leave: nothing was sent"
         for ticket in mates:
             ticket.done(ActionWithheld(reason, servo=ticket.servo))
 
-    def _mates(self, first: Ticket, ready: Collection[int]) -> list[Ticket]:
-        """All that can leave with this one; empty while it cannot leave."""
-        mates = [ticket for ticket in self._tickets.values() if ticket.batch == first.batch and ticket.confirm == first.confirm]
-        if first.batch is None:
+    def _group_of(self, first: Ticket, ready: Collection[int]) -> list[Ticket]:
+        """Return everything that can leave with this ticket; nothing while it cannot leave itself."""
+        batch, confirm = first.batch, first.confirm
+        mates = [ticket for ticket in self.tickets.values() if ticket.batch == batch and ticket.confirm == confirm]
+        if batch is None:
             return [ticket for ticket in mates if ticket.node in ready] if first.node in ready else []
         return mates if all(ticket.node in ready for ticket in mates) else []

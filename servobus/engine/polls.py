@@ -11,11 +11,12 @@ from servobus.protocols.base import Poll
 
 @dataclass(slots=True)
 class PollTimer:
-    """One poll. `due` moves by whole periods."""
+    """When one poll is due next."""
 
     poll: Poll
     due: float
     missed: int = 0
+    """Whole periods that passed without the poll."""
 
     def advance(self, now: float) -> None:
         period = 1.0 / self.poll.hz
@@ -31,23 +32,23 @@ class PollGrid:
 
     def __init__(self) -> None:
         self.due = math.inf
-        """When the next poll is; infinite: never."""
+        """When the next poll is due; infinite: never."""
         self._timers: list[PollTimer] = []
         self._missed_before = 0
 
     def set(self, polls: Sequence[Poll], now: float) -> None:
-        """Instead of those before. Polls of one rate are spread over their period."""
+        """Replace the polls. Those of one rate are spread over their period."""
         self._missed_before = self.missed
         self._timers = [PollTimer(poll, now + index / len(polls) / poll.hz) for index, poll in enumerate(polls)]
         self.due = min((timer.due for timer in self._timers), default=math.inf)
 
     @property
     def missed(self) -> int:
-        """Grid points that passed without their poll, since the beginning."""
+        """Periods that passed without their poll since the start."""
         return self._missed_before + sum(timer.missed for timer in self._timers)
 
     def take(self, now: float) -> Poll | None:
-        """The poll that has been due longest."""
+        """Return the poll that has been due longest."""
         if self.due > now:
             return None
         timer = min(self._timers, key=lambda timer: timer.due)

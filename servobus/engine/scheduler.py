@@ -1,9 +1,10 @@
-"""Decides the next turn: e-stop, goals, requests, polls, probes. Pure: `next_job(now)` returns a decision, the
-master acts on it.
+"""Decides the next job: e-stop > goals > requests > polls > probes. Pure: `next_job(now)` returns a decision.
 
-Two rules hold. A higher class goes first; and after each turn of a class, one turn of a lower class follows if any
-waits, so that nothing starves: a flood of goals still leaves every second turn to requests, every fourth to polls,
-every eighth to probes.
+Two rules hold. A higher class goes first; and after each job of a class, one job of a lower class follows if any waits,
+so that nothing starves: a flood of goals still leaves every second turn to requests, every fourth to polls and every
+eighth to probes. Stops of single servos come before everything but an e-stop, and interrupt no plan.
+
+While an exclusive session is open, goals, polls and probes rest and only the session's requests are served.
 """
 
 from __future__ import annotations
@@ -15,22 +16,28 @@ from functools import partial
 from typing import Any
 
 from servobus.engine.coalescer import Coalescer, Group, Ticket
-from servobus.engine.health import Condition, Health, Node
+from servobus.engine.health import OFFLINE, Node, NodeTable
+from servobus.engine.job import Callback, Job, JobKind
 from servobus.engine.polls import PollGrid
-from servobus.engine.queue import Callback, Job, RequestQueue, overloaded
+from servobus.engine.queue import RequestQueue, overloaded
 from servobus.engine.ramp import SetpointRamps
 from servobus.errors import DeviceError, ReplyTimeout, ServobusError
-from servobus.protocols.base import Driver, GoalPlan, Plan
+from servobus.protocols.base import Driver, GoalPlan, Plan, Poll
 from servobus.values import Outcome
 
 QUEUE_LIMIT = 1024
 """Jobs that may wait on one bus."""
 PROBE_PAUSE = 0.1
-"""Seconds until a node is asked again that answers a probe, but not as it should."""
+"""Seconds until the next probe of a node that answered one with a refusal."""
 POLL_PATIENCE = 1.0
-"""Seconds after which a poll that could not be sent is not wanted any more."""
+"""Seconds after which a poll that could not be sent is dropped."""
+GOALS, REQUESTS, POLLS, PROBES = range(4)
+"""The classes below an e-stop, highest first."""
+CLASSES = 4
 
-OFFLINE = "it is offline: is it powered, are id and baud rate right? It is probed, and served again as soon as it answers"
+NODE_OFFLINE = (
+    "the servo is offline: is it powered, are its id and baud rate right? It is served again as soon as it answers a probe"
+)
 
 
 class Scheduler:
@@ -39,114 +46,157 @@ class Scheduler:
     def __init__(
         self,
         driver: Driver,
-        health: Health,
+        nodes: NodeTable,
         *,
+        enabled_servos: Callable[[Node], Collection[str]],
         on_update: Callable[[Any], None],
         on_restart: Callable[[Node], None],
         on_cut: Callable[[str, Exception], None],
-        cycle: float,
+        on_setpoint: Callable[[str, float], None],
+        goal_rate_hz: float,
         limit: int = QUEUE_LIMIT,
     ) -> None:
-        self.driver = driver
-        self.health = health
+        self.nodes = nodes
         self.coalescer = Coalescer()
-        self.profile = SetpointRamps(cycle, on_cut)
+        self.ramps = SetpointRamps(goal_rate_hz, on_cut, on_setpoint)
         self.requests = RequestQueue(limit)
-        self.estop: deque[Job] = deque()
-        self.stops: deque[Job] = deque()
-        """Stops of single servos: before everything but an e-stop, and no plan is torn for them."""
+        self.polls = PollGrid()
         self.session: object = None
-        """While set, polls, probes and goals rest and only this session's requests are served."""
+        """The open exclusive session."""
         self.split_groups = 0
         self.goal_turns = 0
+        self.wanted: Callable[[], None] = _ignore
+        """Called when something was put that may leave at once: the shell sets it, and then asks for the next action."""
+        self._driver = driver
         self._limit = limit
+        self._enabled_servos = enabled_servos
         self._on_update = on_update
         self._on_restart = on_restart
+        self._estops: deque[Job] = deque()
+        self._stops: deque[Job] = deque()
         self._goal_jobs: deque[tuple[Job, list[Ticket]]] = deque()
-        self.polls = PollGrid()
         self._parked: list[Job] = []
+        """Jobs for offline nodes."""
         self._parked_until = math.inf
-        """When the first of those set aside has waited long enough."""
-        self._lanes = (self._next_goal, self._next_request, self._next_poll, self._next_probe)
-        self._upwards = list(enumerate(self._lanes))[::-1]
-        self._owed = [False] * len(self._lanes)
+        """When the first of the parked jobs has waited long enough."""
+        self._takers = (self._next_goal, self.requests.take, self._next_poll, self._next_probe)
+        self._owed = [False] * CLASSES
+        """Classes that owe one turn to a lower class."""
 
     # What waits
 
-    def submit(self, job: Job, now: float) -> None:
-        """Raises Overloaded. A job for an offline node waits aside for as long as an answer would have taken, and fails then,
-        unless the node comes back: a dead servo costs the line nothing."""
-        node = self.health.node(job.node)
-        if node.condition is Condition.OFFLINE and not job.urgent:
-            if len(self._parked) >= self._limit:
-                raise overloaded(len(self._parked))
-            self._park([job], now + node.deadline)
-        else:
+    def queue(self, job: Job, now: float) -> None:
+        """Queue a request or a plan. Raises Overloaded.
+
+        A job for an offline node is parked for as long as a reply would have taken, and fails then unless the node comes back: a
+        dead servo costs the line nothing.
+        """
+        node = self.nodes.by_id.get(job.node)
+        if node is None or node.health is not OFFLINE or job.even_if_offline:
             self.requests.put(job)
+            return
+        if len(self._parked) >= self._limit:
+            raise overloaded(len(self._parked))
+        self._park([job], now + node.reply_allowance_s)
+
+    def queue_own(self, job: Job) -> None:
+        """Queue a job of the bus itself, of which each node has at most one. Never refused."""
+        self.requests.put_always(job)
+        self.wanted()
 
     def retry(self, job: Job) -> None:
-        """It failed and may be said again: it stays the first of its node, and the other nodes have their turns before it."""
+        """Queue a failed job again: it stays the first of its node, and the other nodes have their turns before it."""
         self.requests.put_back(job)
 
+    def put_goal(self, ticket: Ticket, now: float, *, speed: float | None = None, start: float | None = None) -> None:
+        """Take the newest goal of a servo. With `speed` (unit/s) the host ramps it from `start`, the last setpoint."""
+        if speed is not None:
+            self.ramps.begin(ticket, speed, start, now)
+        elif self.ramps.active:
+            self.ramps.drop({ticket.servo})
+        self.coalescer.put(ticket)
+        self.wanted()
+
+    def put_stop(self, job: Job) -> None:
+        """Put a stop before everything that waits; an e-stop before other stops."""
+        (self._estops if job.kind is JobKind.ESTOP else self._stops).append(job)
+
+    def set_polls(self, polls: Sequence[Poll], now: float) -> None:
+        self.polls.set(polls, now)
+        self.wanted()
+
+    def open_session(self) -> object:
+        self.session = object()
+        return self.session
+
+    def close_session(self) -> None:
+        self.session = None
+        self.wanted()
+
+    @property
+    def estop_pending(self) -> bool:
+        return bool(self._estops)
+
     def waiting(self) -> int:
-        """Everything that waits, for people."""
-        return (
-            len(self.requests)
-            + len(self.coalescer)
-            + len(self._parked)
-            + len(self.estop)
-            + len(self.stops)
-            + len(self._goal_jobs)
-        )
+        """Return the number of jobs and goals that wait, for people."""
+        stops = len(self._estops) + len(self._stops)
+        return stops + len(self.requests) + len(self.coalescer) + len(self._parked) + len(self._goal_jobs)
 
     # The decision
 
     def next_job(self, now: float) -> Job | None:
-        """What shall be on the wire next; None: nothing yet, see `wake`."""
+        """Return the job whose turn it is. None: nothing is due before `wake`."""
         if now >= self._parked_until:  # on a busy line nobody calls `expire`
             self._end_parked(now)
-        if self.estop:
-            return self.estop.popleft()
-        if self.stops:
-            return self.stops.popleft()
+        if self._estops:
+            return self._estops.popleft()
+        if self._stops:
+            return self._stops.popleft()
         if self.session is not None:
             return self.requests.take(now, self.session)
-        if self._only_requests(now):  # nearly always, where callers ask as fast as they can
-            job = self.requests.take(now)
-            return None if job is None else self._served(1, job)
-        for lane, take in enumerate(self._lanes):
-            if not self._owed[lane] and (job := take(now)) is not None:
-                return self._served(lane, job)
-        # Nobody waits to whom a turn is owed, so the others may go on; the lowest of them first: those above owe it one.
-        for lane, take in self._upwards:
-            if self._owed[lane] and (job := take(now)) is not None:
-                return self._served(lane, job)
-        self._owed = [False] * len(self._lanes)  # nobody waits, so nobody is owed anything
-        return None
+        if self._only_requests(now):
+            # Nearly always, where callers ask as fast as they can: decided without asking each class.
+            job = self.requests.take(now) if self.requests.length else None
+            if job is not None:
+                return self._served(REQUESTS, job)
+            self._owed = [False] * CLASSES
+            return None
+        return self._fair_job(now)
 
     def _only_requests(self, now: float) -> bool:
-        """No other class has anything to say."""
+        """Return whether requests wait, and nothing of any other class can be due."""
         return not (
-            len(self.requests) == 0
-            or self._goal_jobs
-            or len(self.coalescer)
-            or len(self.profile)
+            self._goal_jobs
+            or self.coalescer.tickets
+            or self.ramps.active
             or self.polls.due <= now
-            or self.health.troubled
+            or (self.nodes.troubled and self.nodes.due_probe(now))
         )
 
-    def _served(self, lane: int, job: Job) -> Job:
-        """Every class above has had its lower turn; this one owes one now."""
-        for above in range(lane):
+    def _fair_job(self, now: float) -> Job | None:
+        owed = self._owed
+        for each, take in enumerate(self._takers):
+            if not owed[each] and (job := take(now)) is not None:
+                return self._served(each, job)
+        # No class waits to which a turn is owed, so the others may go on; the lowest of them first: those above owe it one.
+        for each in range(CLASSES - 1, -1, -1):
+            if owed[each] and (job := self._takers[each](now)) is not None:
+                return self._served(each, job)
+        self._owed = [False] * CLASSES
+        return None
+
+    def _served(self, served: int, job: Job) -> Job:
+        """Note that every class above has had its lower turn, and this one owes one now."""
+        for above in range(served):
             self._owed[above] = False
-        self._owed[lane] = True
+        self._owed[served] = True
         return job
 
     def wake(self) -> float | None:
-        """The next moment at which something becomes due or too old, if nothing else happens."""
+        """Return when something becomes due or too old, if nothing else happens; None: never."""
         times = [self._parked_until, self.requests.next_expiry(), self.coalescer.next_expiry()]
         if self.session is None:
-            times += (self.polls.due, self.health.next_probe(), self.profile.next_due())
+            times += (self.polls.due, self.nodes.next_probe(), self.ramps.next_due())
         soonest = min(time for time in times if time is not None)
         return None if soonest == math.inf else soonest
 
@@ -156,11 +206,14 @@ class Scheduler:
         self.coalescer.expire(now)
         self._end_parked(now)
 
+    # Offline nodes
+
     def node_changed(self, node: Node) -> None:
-        """Jobs set aside for a node that came back go on; those in the queue of one that went offline are set aside."""
-        if node.condition is Condition.OFFLINE:
+        """Park the jobs of a node that went offline; serve the parked jobs of one that came back."""
+        if node.health is OFFLINE:
             went = node.next_probe - node.backoff
-            self._park(self.requests.remove(lambda job: job.node == node.id and not job.urgent), went + node.deadline)
+            jobs = self.requests.remove(lambda job: job.node == node.id and not job.even_if_offline)
+            self._park(jobs, went + node.reply_allowance_s)
             return
         for job in reversed(self._unpark(lambda job: job.node == node.id)):
             self.requests.put_back(job)
@@ -181,11 +234,16 @@ class Scheduler:
         return out
 
     def _end_parked(self, now: float) -> None:
+        if not self._parked:
+            return
         for job in self._unpark(lambda job: job.expires <= now or job.sink.done()):
-            job.fail(ReplyTimeout(OFFLINE, request=job.request, raw=job.request.frame if job.request else b""))
+            request = None if job.plan is not None else job.request
+            job.fail(ReplyTimeout(NODE_OFFLINE, request=request, raw=b"" if request is None else request.frame))
+
+    # Ends
 
     def drop_goals(self, error: Callable[[str], ServobusError], servos: Collection[str] | None = None) -> None:
-        """End all goals that have not left, or those of some servos, with an error; the others of a frame are planned anew."""
+        """End all goals that have not left, or those of some servos, with an error. The others of a plan are planned anew."""
         goal_jobs, self._goal_jobs = self._goal_jobs, deque()
         for job, tickets in goal_jobs:
             if servos is None or any(ticket.servo in servos for ticket in tickets):
@@ -193,107 +251,105 @@ class Scheduler:
             else:
                 self._goal_jobs.append((job, tickets))
         self.coalescer.drop(error, servos)
-        self.profile.drop(servos)
+        self.ramps.drop(servos)
 
     def drop(self, error: Callable[[str], ServobusError], *, motion_only: bool) -> None:
         """End everything that waits, or only what would move something."""
         self.drop_goals(error)
-        unwanted = self.requests.remove(lambda job: job.motion or not motion_only)
-        unwanted += self._unpark(lambda job: job.motion or not motion_only)
-        unwanted += self.stops
-        self.stops.clear()
+
+        def unwanted(job: Job) -> bool:
+            return job.kind is JobKind.MOTION or not motion_only
+
+        ended = [*self.requests.remove(unwanted), *self._unpark(unwanted), *self._stops]
+        self._stops.clear()
         if not motion_only:
-            unwanted += self.estop
-            self.estop.clear()
-        for job in unwanted:
+            ended += self._estops
+            self._estops.clear()
+        for job in ended:
             job.fail(error(""))
 
-    # The lanes
+    # The classes
 
     def _next_goal(self, now: float) -> Job | None:
-        for ticket in self.profile.due(now):
+        for ticket in self.ramps.due(now):
             self.coalescer.put(ticket)
         while self._goal_jobs or self._plan_goals(now):
             job, tickets = self._goal_jobs.popleft()
-            ready = self.health.reachable()
+            ready = self.nodes.reachable()
             if all(ticket.node in ready and ticket.expires > now and not ticket.gone() for ticket in tickets):
                 self.goal_turns += 1
                 return job
-            # A frame of a split group waited, and is too old now, or a servo of it missed an answer: it may have restarted.
+            # A plan of a split group waited, and is too old now, or a servo of it missed a reply: it may have restarted.
             self._unplan(job, tickets)
         return None
 
     def _unplan(self, job: Job, tickets: Sequence[Ticket]) -> None:
-        """The frame does not leave; its goals wait again."""
+        """Take a plan back that has not begun; its goals wait again."""
         assert job.plan is not None
         job.plan.close()
         for ticket in tickets:
             self.coalescer.put_back(ticket)
 
     def _plan_goals(self, now: float) -> bool:
-        """Make jobs of the next group; False: none is ready."""
+        """Make jobs of the next group. False: no group is ready."""
         while len(self.coalescer):
-            group = self.coalescer.take(now, self.health.reachable())
+            group = self.coalescer.take(now, self.nodes.reachable())
             if group is None:
                 return False
             try:
-                turns = self.driver.plan_goals(
+                plans = self._driver.plan_goals(
                     [ticket.goal for ticket in group.tickets], together=group.together, confirm=group.confirm
                 )
             except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its goals, never the bus
                 for ticket in group.tickets:
                     ticket.done(error)
                 continue
-            self.split_groups += len(turns) > 1
-            self._goal_jobs.extend(self._goal_job(turn, group) for turn in turns)
+            self.split_groups += len(plans) > 1
+            self._goal_jobs.extend(_goal_job(plan, group) for plan in plans)
             return True
         return False
 
-    @staticmethod
-    def _goal_job(turn: GoalPlan, group: Group) -> tuple[Job, list[Ticket]]:
-        tickets = [ticket for ticket in group.tickets if ticket.servo in turn.servos]
-        expires = max(ticket.expires for ticket in tickets)
-        sink = Callback(lambda result: _settle(tickets, result))
-        return Job(sink, expires, plan=turn.plan, node=tickets[0].node, motion=True), tickets
-
-    def _next_request(self, now: float) -> Job | None:
-        return self.requests.take(now)
-
     def _next_poll(self, now: float) -> Job | None:
         while (poll := self.polls.take(now)) is not None:
-            request = poll.request(self.health.reachable())
+            request = poll.request(self.nodes.reachable())
             if request is not None:
                 return Job(Callback(self._on_update), now + POLL_PATIENCE, request=request, tries=1)
         return None
 
     def _next_probe(self, now: float) -> Job | None:
-        node = self.health.due_probe(now)
+        node = self.nodes.due_probe(now)
         if node is None:
             return None
-        return Job(
-            Callback(partial(_probed, node, now + PROBE_PAUSE)),
-            now + POLL_PATIENCE,
-            plan=self.recovery(node),
-            node=node.id,
-            recovery=True,
-        )
+        sink = Callback(partial(_probed, node, now + PROBE_PAUSE))
+        return Job(sink, now + POLL_PATIENCE, plan=self.fence(node), node=node.id, kind=JobKind.PROBE)
 
-    def recovery(self, node: Node) -> Plan[bool]:
-        """The fence, and whether the servo still is as we left it. What makes a doubtful node believed again."""
-        kept = yield from self.driver.fence(node.id, list(node.outstanding), node.enabled)
+    def fence(self, node: Node) -> Plan[bool]:
+        """Return the plan after which a node is believed again. Its result: whether the servo still is as we left it."""
+        kept = yield from self._driver.fence(node.id, list(node.outstanding), self._enabled_servos(node))
         if not kept:
             self._on_restart(node)
-        self.health.recovered(node)
+        self.nodes.fenced(node)
         return kept
 
 
-def _settle(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | Exception) -> None:
-    """One result or one error for all of a turn's tickets."""
+def _ignore() -> None:
+    pass
+
+
+def _goal_job(plan: GoalPlan, group: Group) -> tuple[Job, list[Ticket]]:
+    tickets = [ticket for ticket in group.tickets if ticket.servo in plan.servos]
+    expires = max(ticket.expires for ticket in tickets)
+    sink = Callback(partial(_end_tickets, tickets))
+    return Job(sink, expires, plan=plan.plan, node=tickets[0].node, kind=JobKind.MOTION), tickets
+
+
+def _end_tickets(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | Exception) -> None:
+    """End the tickets of one plan, with a result for each or with one error for all."""
     for ticket in tickets:
         ticket.done(result[ticket.servo] if isinstance(result, dict) else result)
 
 
 def _probed(node: Node, later: float, result: object) -> None:
-    """A probe's outcome stands in the node's health; one that was refused is not asked again at once."""
+    """Put off the next probe of a node that refused this one; every other outcome is in the node's health already."""
     if isinstance(result, DeviceError):
         node.next_probe = max(node.next_probe, later)

@@ -1,30 +1,62 @@
-"""What a bus counts, and how long its turns take. Pure: told everything, asks nothing."""
+"""What a bus counts, and how long its turns take. Pure: it is told everything and asks for nothing."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter as Tally
+from collections.abc import Iterator, Mapping
+
+from servobus.values import Described
 
 SUB_BUCKETS = 8
 """Per doubling, so a percentile is true to within 1/8."""
 
 
-class Histogram:
-    """Durations in buckets of logarithmic width, from a microsecond up; bounded whatever it is fed."""
+class Counter(Described):
+    """The counters of a bus, under the names that `servobus stats` shows."""
 
-    __slots__ = ("_buckets", "count", "greatest", "total")
+    FRAMES = "frames", "Frames sent."
+    BYTES_SENT = "bytes_sent", "Bytes sent."
+    BYTES_RECEIVED = "bytes_received", "Bytes received, echoes and garbage included."
+    TURNS = "turns", "Requests that received all their replies."
+    TIMEOUTS = "timeouts", "Requests whose replies did not all arrive in time, or could not be believed."
+    RETRIES = "retries", "Requests that were sent once more."
+    FENCES = "fences", "Fences sent before a doubtful node was believed again."
+    STRAYS = "strays", "Valid frames that answered no request."
+    REJECTED_WINDOWS = "rejected_windows", "Replies discarded because bytes that are not a valid frame followed them."
+    UNSOLICITED_BYTES = "unsolicited_bytes", "Bytes received while no reply was due."
+    ECHOES = "echoes", "Own requests that came back."
+    COLLISIONS = "collisions", "Times that other bytes arrived where the echo of our own was due."
+    DRAINS = "drains", "Times that the line was left silent until stray bytes had passed."
+    LINE_LOST = "line_lost", "Times that the line was lost."
+    RESTARTS = "restarts", "Nodes found to have restarted."
+    POLLED = "polled", "Servo states brought by polls."
+    POLLS_MISSED = "polls_missed", "Poll times that passed without their poll, because the line was busy."
+    GOALS = "goals", "Goals accepted."
+    GOALS_ACKED = "goals_acked", "Goals that the servo confirmed."
+    GOALS_SENT = "goals_sent", "Goals sent without a confirmation, because the protocol has none."
+    GOALS_SUPERSEDED = "goals_superseded", "Goals replaced by a newer goal of the same servo before they were sent."
+    GOALS_FAILED = "goals_failed", "Goals that ended with an error."
+    GOALS_CLAMPED = "goals_clamped", "Goals moved to the nearest value inside a limit (`on_limit: clamp`)."
+    GOAL_TURNS = "goal_turns", "Goal plans begun; each carries the goals of one or more servos."
+    GOAL_GROUPS_SPLIT = "goal_groups_split", "Groups of goals that did not fit one plan."
+
+
+class Histogram:
+    """Durations in buckets of logarithmic width, from a microsecond up; its size never grows."""
+
+    __slots__ = ("_buckets", "count", "max", "total")
 
     def __init__(self) -> None:
         self.count = 0
         self.total = 0.0
-        self.greatest = 0.0
+        self.max = 0.0
         self._buckets = [0] * (SUB_BUCKETS * 40)
 
     def add(self, seconds: float) -> None:
         self.count += 1
         self.total += seconds
-        if seconds > self.greatest:
-            self.greatest = seconds
+        if seconds > self.max:
+            self.max = seconds
         microseconds = int(seconds * 1e6)
         if microseconds < SUB_BUCKETS:
             self._buckets[max(microseconds, 0)] += 1
@@ -34,14 +66,14 @@ class Histogram:
         self._buckets[min(index, len(self._buckets) - 1)] += 1
 
     def percentile(self, share: float) -> float:
-        """Seconds that `share` (0 to 1) of the durations do not exceed; 0 when there are none."""
+        """Return the seconds that `share` (0 to 1) of the durations do not exceed; 0 while there are none."""
         wanted = share * self.count
-        seen = 0
+        total = 0
         for upper, count in self.buckets():
-            seen += count
-            if seen >= wanted:
-                return min(upper, self.greatest)
-        return self.greatest
+            total += count
+            if total >= wanted:
+                return min(upper, self.max)
+        return self.max
 
     def buckets(self) -> Iterator[tuple[float, int]]:
         """Upper bound in seconds and count of every bucket that is not empty, ascending."""
@@ -52,27 +84,30 @@ class Histogram:
                 yield upper / 1e6, count
 
 
+NO_COUNTS: Mapping[Counter, int] = {}
+
+
 class BusStats:
     """Counters and histograms of one bus."""
 
     __slots__ = ("busy", "counts", "started", "turns")
 
     def __init__(self, now: float) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Tally[Counter] = Tally()
         self.turns = Histogram()
         self.busy = 0.0
-        """Seconds of wire time said and heard."""
+        """Seconds of wire time, sent and received."""
         self.started = now
 
-    def snapshot(self, now: float) -> dict[str, object]:
-        """For people and machines: plain numbers, durations in milliseconds, load in percent."""
+    def snapshot(self, now: float, more: Mapping[Counter, int] = NO_COUNTS) -> dict[str, object]:
+        """Plain numbers for people and machines: durations in milliseconds, load in percent. `more`: counters kept elsewhere."""
         elapsed = now - self.started
         return {
-            **{name: self.counts[name] for name in sorted(self.counts)},
+            **{counter.value: count for counter, count in sorted({**self.counts, **more}.items())},
             "wire_load_percent": round(100 * self.busy / elapsed, 1) if elapsed > 0 else 0.0,
             "turn_ms": {
                 "p50": round(1e3 * self.turns.percentile(0.50), 3),
                 "p99": round(1e3 * self.turns.percentile(0.99), 3),
-                "max": round(1e3 * self.turns.greatest, 3),
+                "max": round(1e3 * self.turns.max, 3),
             },
         }

@@ -232,7 +232,7 @@ class LocalRig(Rig):
     def known(self, name: str, max_age: float) -> State | None:
         """What `read` would answer without a turn; None: it would need one."""
         bus, servo = self.bus_of(name)
-        return bus.state(servo) if bus.knows(servo, max_age) else None
+        return bus.state(servo) if bus.is_fresh(servo, max_age) else None
 
     def snapshot(self) -> Snapshot:
         return {name: self.buses[bus].state(servo) for name, (bus, servo) in self._names.items()}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from servobus.engine.stats import Counter
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import LineTraits
 from servobus.protocols.sms.codec import Instruction, encode
@@ -64,7 +65,7 @@ async def test_a_late_reply_is_never_taken_for_the_next_one() -> None:
         assert value == 0, "the late 111 was dropped, the retry's answer was taken"
         assert puppet.heard[0] == POSITION
         assert puppet.heard[1][5] == FENCE, "a fence went before the retry"
-        assert bus.stats.counts["timeouts"] == 1
+        assert bus.stats.counts[Counter.TIMEOUTS] == 1
 
 
 @virtual
@@ -72,10 +73,10 @@ async def test_a_doubled_reply_makes_its_node_doubtful_and_nothing_else() -> Non
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = once(POSITION, [(0.001, reply(1, 7) * 2)])
         assert await bus.read_register("s1", "present_position", raw=True) == 7
-        assert bus.health.node(1).condition == "doubtful"
-        assert bus.health.node(2).condition == "online"
+        assert bus.nodes.node(1).health == "doubtful"
+        assert bus.nodes.node(2).health == "online"
         assert await bus.read_register("s1", "present_position", raw=True) == 0
-        assert bus.health.node(1).condition == "online"
+        assert bus.nodes.node(1).health == "online"
 
 
 @virtual
@@ -83,7 +84,7 @@ async def test_junk_behind_the_answer_rejects_it() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = once(POSITION, [(0.001, reply(1, 7) + b"\x55")])
         assert await bus.read_register("s1", "present_position", raw=True) == 0
-        assert bus.stats.counts["rejected_windows"] == 1
+        assert bus.stats.counts[Counter.REJECTED_WINDOWS] == 1
 
 
 @virtual
@@ -93,7 +94,7 @@ async def test_bytes_nobody_asked_for_are_listened_out() -> None:
         started = bus.clock()
         assert await bus.read_register("s2", "present_position", raw=True) == 0
         assert bus.clock() - started >= 0.002
-        assert bus.stats.counts["unsolicited_bytes"] == 8
+        assert bus.stats.counts[Counter.UNSOLICITED_BYTES] == 8
         assert any(frame[2] == 1 and frame[5] == FENCE for frame in puppet.heard), "the one who spoke was asked who it is"
 
 
@@ -127,7 +128,7 @@ async def test_auto_hears_whether_the_line_echoes(echoes: bool, found: str) -> N
         await bus.start()
         assert (bus.line.echo is not None) is echoes
         assert await bus.read_register("s1", "present_position", raw=True) == 0
-        assert bus.stats.counts["timeouts"] == 1, "only the probe's question had no answer"
+        assert bus.stats.counts[Counter.TIMEOUTS] == 1, "only the probe's question had no answer"
 
 
 @virtual
@@ -136,7 +137,7 @@ async def test_echo_on_takes_our_own_bytes_out() -> None:
         puppet.script = lambda frame: [(0.0002, frame[:3]), (0.0004, frame[3:] + puppet.usual(frame)[0][1])]
         await bus.start()
         assert await bus.read_register("s2", "present_position", raw=True) == 0
-        assert bus.stats.counts["timeouts"] == 0
+        assert bus.stats.counts[Counter.TIMEOUTS] == 0
 
 
 @virtual
@@ -196,7 +197,7 @@ async def test_a_cancelled_caller_tears_no_turn() -> None:
             await first
         assert await second == 0
         assert [frame for frame in puppet.heard if frame[2] == 1] == [POSITION]
-        assert bus.stats.counts["timeouts"] == 0
+        assert bus.stats.counts[Counter.TIMEOUTS] == 0
 
 
 @virtual
@@ -220,7 +221,7 @@ async def test_no_answer_ends_in_a_timeout_that_says_what_was_asked() -> None:
             await bus.read_register("s1", "present_position")
         assert "powered" in str(caught.value)
         assert caught.value.raw
-        assert bus.master.runner.idle
+        assert bus.engine.idle
 
 
 @virtual
@@ -245,4 +246,4 @@ async def test_what_arrived_and_was_not_read_yet_is_not_late() -> None:
         puppet.script = once(POSITION, [])
         assert await bus.read_register("s1", "present_position", raw=True) == 42
         assert len(looked) == 1
-        assert bus.stats.counts["timeouts"] == 0
+        assert bus.stats.counts[Counter.TIMEOUTS] == 0

@@ -6,7 +6,8 @@ import asyncio
 
 import pytest
 
-from servobus.engine.queue import Job
+from servobus.engine.job import Job
+from servobus.engine.stats import Counter
 from servobus.errors import LinkDown, Overloaded
 from tests.engine.scripted_line import puppet_bus
 from tests.virtual_time import virtual
@@ -27,7 +28,7 @@ async def test_a_lost_line_ends_everything_and_comes_back() -> None:
                 await call
         await closed
         assert not bus.master.up
-        assert repr(bus.master) == "arm: 2 servos, 0 in flight, 0 queued"
+        assert repr(bus.master) == "arm: 2 nodes, 0 in flight, 0 queued"
         for attempt in (bus.read_register("s1", "id"), bus.ping("s1")):
             with pytest.raises(LinkDown, match="down"):
                 await attempt
@@ -37,7 +38,7 @@ async def test_a_lost_line_ends_everything_and_comes_back() -> None:
         link.plug()
         await link.connect(bus.master)
         assert await bus.read_register("s1", "present_position", raw=True) == 0
-        assert bus.stats.counts["line_lost"] == 1
+        assert bus.stats.counts[Counter.LINE_LOST] == 1
 
 
 @virtual

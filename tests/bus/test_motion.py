@@ -66,7 +66,7 @@ async def test_an_e_stop_in_the_moment_in_which_enable_succeeds_wins() -> None:
             return answers
 
         puppet.script = script
-        with pytest.raises(EStopped, match="while it was being enabled"):
+        with pytest.raises(EStopped, match="while the servo was being enabled"):
             await bus.motion.enable("s1")
         assert not bus.records["s1"].enabled
 
@@ -105,7 +105,7 @@ async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = keeping()
         await bus.motion.enable("s1")
-        bus.records["s1"].setpoint = 50.0
+        bus.records["s1"].goal = 50.0
         settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
         await asyncio.sleep(0.1)
         assert not settling.done()
@@ -113,8 +113,8 @@ async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
             await bus.motion.disable("s1")
         else:
             puppet.script = lambda frame: None  # its torque reads 0 again
-            bus.health.suspect_all()
-        with pytest.raises(NotEnabled, match=r"arm/s1.*before it stood at its goal"):
+            bus.nodes.suspect_all()
+        with pytest.raises(NotEnabled, match=r"arm/s1.*before it arrived at its goal"):
             await settling
 
 
@@ -125,7 +125,7 @@ async def test_a_stop_while_its_place_is_read_is_not_taken_for_its_goal() -> Non
         keep, asked = keeping(), asyncio.Event()
         puppet.script = keep
         await bus.motion.enable("s1")
-        bus.records["s1"].setpoint = 50.0
+        bus.records["s1"].goal = 50.0
 
         def script(frame: bytes) -> Answers | None:
             asked.set()
@@ -135,7 +135,7 @@ async def test_a_stop_while_its_place_is_read_is_not_taken_for_its_goal() -> Non
         settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
         await asked.wait()
         await bus.motion.stop()
-        with pytest.raises(EStopped, match="before it stood at its goal"):
+        with pytest.raises(EStopped, match="before the servo arrived at its goal"):
             await settling
 
 
@@ -178,7 +178,8 @@ async def test_the_e_stop_ends_an_enable_under_way() -> None:
 @virtual
 async def test_a_servo_that_does_not_reach_its_park_pose_goes_limp_all_the_same() -> None:
     async with puppet_bus(PARKED) as (bus, puppet, _, _):
-        bus.records["s1"].enabled = True
+        puppet.script = keeping()
+        await bus.motion.enable("s1")
         report = await bus.motion.park("s1")
         assert (report.action, report.written, report.confirmed) == ("park", True, False)
         assert "park pose" in report.detail
@@ -203,4 +204,4 @@ async def test_one_outcome_for_each_goal_of_a_frame() -> None:
         futures = bus.motion.put(goals, together=True, confirm=False)
         assert await asyncio.gather(*futures.values()) == [Outcome.SENT, Outcome.SENT]
         assert len(puppet.heard) == 1
-        assert bus.records["s1"].setpoint == 5
+        assert bus.records["s1"].setpoint == bus.records["s1"].goal == 5

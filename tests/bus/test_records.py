@@ -1,29 +1,28 @@
-"""What is remembered of a servo between two turns."""
+"""What the record of a servo keeps between two turns."""
 
 from __future__ import annotations
 
 import pytest
 
-from servobus import values
 from servobus.bus.records import ServoRecord
-from servobus.engine.health import Health
+from servobus.engine.health import NodeTable
 from servobus.protocols.options import ServoOptions
-from servobus.values import State
+from servobus.values import Health, State
 
 
 @pytest.fixture
 def record() -> ServoRecord:
-    health = Health((1,), changed=lambda node, before: None)
-    return ServoRecord("elbow", ServoOptions(id=1), health.node(1))
+    nodes = NodeTable((1,), changed=lambda node, before: None)
+    return ServoRecord("elbow", ServoOptions(id=1), nodes.node(1))
 
 
-def test_of_a_servo_nobody_heard_nothing_is_known(record: ServoRecord) -> None:
-    assert record.state(5.0, ()) == State(health=values.Health.DOUBTFUL)
+def test_a_servo_that_never_replied_has_an_empty_state(record: ServoRecord) -> None:
+    assert record.state(5.0, ()) == State(health=Health.DOUBTFUL)
     assert record.reference() is None
     assert record.position(5.0, 1e9) is None
 
 
-def test_fields_stay_until_newer_ones_come_and_the_age_is_that_of_the_newest(record: ServoRecord) -> None:
+def test_a_field_stays_until_a_newer_one_comes_and_age_is_that_of_the_newest(record: ServoRecord) -> None:
     record.update({"position": 1.0, "voltage": 12.0}, 10.0)
     record.update({"position": 2.0}, 11.0)
     state = record.state(11.5, ("overheat",))
@@ -38,17 +37,17 @@ def test_a_position_is_fresh_up_to_its_age(record: ServoRecord) -> None:
     assert record.position(10.26, 0.25) is None, "another field does not make it fresh"
 
 
-def test_a_step_counts_from_the_setpoint_else_from_the_position(record: ServoRecord) -> None:
+def test_a_step_counts_from_the_goal_else_from_the_position(record: ServoRecord) -> None:
     record.update({"position": 7.0}, 10.0)
     assert record.reference() == 7.0
-    record.setpoint = 0.0
+    record.goal = 0.0
     assert record.reference() == 0.0
 
 
-def test_the_goal_is_our_setpoint_else_what_the_servo_says(record: ServoRecord) -> None:
+def test_the_goal_is_ours_else_the_one_that_the_servo_reports(record: ServoRecord) -> None:
     record.update({"goal": 3.0}, 10.0)
     assert record.state(10.0, ()).goal == 3.0
-    record.setpoint = 0.0
+    record.goal = 0.0
     assert record.state(10.0, ()).goal == 0.0
 
 
@@ -59,8 +58,8 @@ def test_the_status_is_that_of_the_last_reply_else_what_was_read(record: ServoRe
     assert record.state(11.0, ()).status == 0
 
 
-def test_enabled_and_health_are_our_own_knowledge(record: ServoRecord) -> None:
+def test_enabled_and_health_are_kept_by_the_host(record: ServoRecord) -> None:
     record.enabled = True
-    record.node.recovered()
+    record.node.fenced()
     state = record.state(0.0, ())
     assert (state.enabled, state.health) == (True, "online")

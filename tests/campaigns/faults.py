@@ -12,7 +12,9 @@ import random
 from dataclasses import dataclass, field
 from typing import Literal
 
-from servobus.bus.service import PATIENCE, BusService
+from servobus.bus.requests import PATIENCE
+from servobus.bus.service import BusService
+from servobus.engine.stats import Counter
 from servobus.errors import ServobusError
 from servobus.protocols.options import FaultOptions
 from tests.campaigns.oracle import SERVOS, Oracle, service
@@ -96,9 +98,9 @@ async def _read(bus: BusService, oracle: Oracle, rng: random.Random, result: Res
 
 
 async def _end(bus: BusService, result: Result) -> Result:
-    result.turns = bus.stats.counts["turns"]
+    result.turns = bus.stats.counts[Counter.TURNS]
     result.waiting = bus.scheduler.waiting()
-    result.counts = dict(bus.stats.counts)
+    result.counts = {counter.value: count for counter, count in bus.stats.counts.items()}
     await bus.master.close()
     result.leaked = len(asyncio.all_tasks()) - 1
     return result

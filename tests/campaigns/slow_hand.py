@@ -9,6 +9,7 @@ from pathlib import Path
 
 from servobus.bus.service import BusService
 from servobus.config.loader import parse_config
+from servobus.engine.stats import Counter
 from servobus.errors import ReplyTimeout
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
@@ -48,9 +49,9 @@ async def _slow_hand(reads: int, rng: random.Random) -> Result:
         for number in range(reads):
             await _read(bus, hands[0], number, rng, result)
             await asyncio.sleep(0.05)
-        result.turns = bus.stats.counts["turns"]
+        result.turns = bus.stats.counts[Counter.TURNS]
         result.waiting = bus.scheduler.waiting()
-        result.counts = dict(bus.stats.counts)
+        result.counts = {counter.value: count for counter, count in bus.stats.counts.items()}
         await bus.master.close()
     result.leaked = len(asyncio.all_tasks()) - 1
     return result

@@ -1,80 +1,92 @@
-"""A runner whose line the test speaks for, and plans for it to run."""
+"""An engine whose line the test plays, and plans for it to run."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from servobus.engine.engine import Runner
-from servobus.engine.queue import Job
+from servobus.engine.engine import Engine, WaitUntil
+from servobus.engine.job import Job, JobKind
+from servobus.engine.line import Line
 from servobus.engine.stats import BusStats
-from servobus.engine.turn import Turn, judge
+from servobus.engine.turn import Transmit, Turn
 from servobus.errors import ServobusError
-from servobus.protocols.base import Plan, Request
+from servobus.protocols.base import LineTraits, Plan, Request
 from tests.engine.toy_protocol import ANSWER, PING, READ, Bench, Sink, ToyCodec, read, reply, shout
 
 
 class Rig(Bench):
-    """A runner whose line the test speaks for. All nodes are online unless the test says otherwise."""
+    """An engine driven by bytes and times. All nodes are online unless the test says otherwise."""
 
-    def __init__(self, *nodes: int, **keys: Any) -> None:
-        super().__init__(*nodes, **keys)
+    def __init__(self, *nodes: int, online: bool = True, **options: Any) -> None:
+        super().__init__(*nodes, online=online, **options)
         self.stats = BusStats(0.0)
-        self.runner = Runner("arm", self.scheduler, self.health, self.stats)
+        self.line = Line(LineTraits())
+        self.engine = Engine("arm", ToyCodec(), self.scheduler, self.line, self.stats)
+        self.engine.opened(0.0)
+        if online:
+            for node in list(self.nodes.by_id.values()):
+                self.nodes.fenced(node)
+            self.changes.clear()
         self.now = 1.0
 
     def submit(self, request: Request[Any] | None = None, *, plan: Plan[Any] | None = None, **traits: Any) -> list[Any]:
-        """What its caller was told."""
+        """Submit a job; returns the list into which its result is put."""
         sink = Sink()
-        self.scheduler.submit(Job(sink, 100.0, request=request, plan=plan, **traits), self.now)
+        self.engine.submit(Job(sink, 100.0, request=request, plan=plan, **traits), self.now)
         return sink.results
 
     def estop(self, plan: Plan[Any]) -> list[Any]:
         sink = Sink()
-        self.scheduler.drop(self.runner.estopped, motion_only=True)
-        self.scheduler.estop.append(Job(sink, 100.0, plan=plan, node=1))
+        self.engine.submit_stop(Job(sink, 100.0, plan=plan, node=1, kind=JobKind.ESTOP))
         return sink.results
 
+    def transmit(self) -> Transmit | None:
+        """The next frame that the engine transmits, after any silence that it waits for; None: nothing is to be sent."""
+        action = self.engine.next_action(self.now)
+        while isinstance(action, WaitUntil) and self.line.waiting_for_silence:
+            self.now = action.when
+            action = self.engine.next_action(self.now)
+        return action if isinstance(action, Transmit) else None
+
     def next(self) -> bytes:
-        """The payload said next; empty: nothing. What nobody answers is reported as sent."""
-        request = self.runner.next_request(self.now)
-        if request is None:
+        """The payload transmitted next; empty: nothing. A request without replies is concluded."""
+        action = self.transmit()
+        if action is None:
             return b""
-        if not request.replies:
-            self.runner.sent(request)
-        return request.frame[3:-1]
+        self.engine.deliver()
+        return action.frame[3:-1]
 
     def hear(self, *frames: bytes, latency: float = 0.001) -> Turn:
-        """The next request is said, and these frames are all that comes."""
-        request = self.runner.next_request(self.now)
-        assert request is not None
-        turn, codec, strays = Turn(request, sent_at=self.now, sent_by=self.now, deadline=self.now), ToyCodec(), list[Any]()
-        codec.receive_data(b"".join(frames))
-        believed = judge(codec, turn, strays)
-        if strays:
-            self.runner.strays(strays, turn, self.now)
-        if believed:
-            self.runner.answered(turn, latency)
-        else:
-            self.runner.missed(turn, self.now, latency)
+        """The next request is transmitted, and these frames are all that comes."""
+        turn = self.transmit()
+        assert isinstance(turn, Turn)
+        self.receive(*frames, after=latency)
+        if self.engine.in_flight:
+            self.now = turn.deadline
+            self.engine.timed_out(self.now)
         return turn
 
+    def receive(self, *frames: bytes, after: float = 0.001) -> None:
+        """These frames arrive in one piece."""
+        self.now += after
+        if frames:
+            self.engine.receive(b"".join(frames), self.now)
+        self.engine.deliver()
+
     def answer(self, value: int = 0) -> bytes:
-        """The next request is said and properly answered; its payload."""
-        request = self.runner.next_request(self.now)
-        assert request is not None
-        payload = request.frame[3:-1]
-        told = payload[1] if payload[0] == PING else value
-        self.hear(*(reply(node, payload[0], told).frame for node in request.nodes))
+        """The next request is transmitted and answered as it should be; returns its payload."""
+        turn = self.transmit()
+        assert isinstance(turn, Turn)
+        payload = turn.frame[3:-1]
+        self.receive(*(reply(node, payload[0], payload[1] if payload[0] == PING else value).frame for node in turn.request.nodes))
         return payload
 
     def miss(self) -> bytes:
-        request = self.runner.next_request(self.now)
-        assert request is not None
-        self.hear()
-        return request.frame[3:-1]
+        """The next request is transmitted, and nothing comes; returns its payload."""
+        return self.hear().frame[3:-1]
 
     def doubt(self, node: int, key: Any = READ | ANSWER) -> None:
-        self.health.doubt(self.node(node), key, self.now)
+        self.nodes.doubt(self.node(node), key, self.now)
 
 
 def three_reads() -> Plan[list[int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from servobus.engine.queue import Job
+from servobus.engine.job import Job, JobKind
 from servobus.errors import EStopped, NotEnabled, ServobusError
 from servobus.protocols.base import Plan, run_plan
 from tests.engine.toy_protocol import READ, Bench, Sink, poll, read, ticket
@@ -12,8 +12,8 @@ from tests.engine.toy_protocol import READ, Bench, Sink, poll, read, ticket
 Ended = list[tuple[str, Any]]
 
 
-def job(node: int, *, expires: float = 10.0, motion: bool = False, urgent: bool = False, session: object = None) -> Job:
-    return Job(Sink(), expires, request=read(node), motion=motion, urgent=urgent, session=session)
+def job(node: int, *, expires: float = 10.0, **traits: Any) -> Job:
+    return Job(Sink(), expires, request=read(node), **traits)
 
 
 def results(of: Job) -> list[Any]:
@@ -26,16 +26,15 @@ def stop_job() -> Job:
         yield read(1)
         return "stopped"
 
-    return Job(Sink(), 10.0, plan=plan(), node=1)
+    return Job(Sink(), 10.0, plan=plan(), node=1, kind=JobKind.ESTOP)
 
 
 def kind(taken: Job | None) -> str:
     if taken is None:
         return "-"
-    if taken.recovery:
-        return "probe"
+    names = {JobKind.PROBE: "probe", JobKind.MOTION: "goal", JobKind.ESTOP: "estop"}
     if taken.plan is not None:
-        return "goal" if taken.motion else "estop"
+        return names[taken.kind]
     return "request" if isinstance(taken.sink, Sink) else "poll"
 
 
@@ -63,16 +62,16 @@ class Flood:
         self.now = 0.0
         self._ended: Ended = []
         if "poll" in classes:
-            self.bench.scheduler.polls.set([poll("feedback", 1000, 1, 2)], 0.0)
+            self.bench.scheduler.set_polls([poll("feedback", 1000, 1, 2)], 0.0)
         if "probe" in classes:
-            self.bench.health.missed(self.bench.node(3), READ, 0.0, 0.0)
+            self.bench.nodes.missed(self.bench.node(3), READ, 0.0, 0.0)
 
     def turn(self) -> Job | None:
         self.now += 0.001
         if "goal" in self.classes:
             self.bench.coalescer.put(ticket(1, self._ended, expires=self.now + 1))
         if "request" in self.classes and len(self.bench.scheduler.requests) < 4:
-            self.bench.scheduler.submit(job(2, expires=self.now + 1), self.now)
+            self.bench.scheduler.queue(job(2, expires=self.now + 1), self.now)
         return self.bench.scheduler.next_job(self.now)
 
     def kinds(self, count: int) -> list[str]:
@@ -81,7 +80,7 @@ class Flood:
 
 def split_bench(ended: Ended, **traits: Any) -> tuple[Bench, Job]:
     """Three goals, a frame each; the first frame has been taken."""
-    bench = Bench(1, 2, 3, most=1)
+    bench = Bench(1, 2, 3, goals_per_frame=1)
     for number in (1, 2, 3):
         bench.coalescer.put(ticket(number, ended, **traits))
     first = bench.scheduler.next_job(0.0)

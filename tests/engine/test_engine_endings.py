@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from servobus.engine.job import JobKind
+from servobus.engine.stats import Counter
 from servobus.errors import EStopped, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.base import Plan
 from tests.engine.driven_engine import FENCE, Rig, ask, stop_plan, three_reads
-from tests.engine.toy_protocol import ANSWER, READ, read, reply, ticket
+from tests.engine.toy_protocol import ANSWER, PING, READ, read, reply, ticket
 
 # Restarts
 
@@ -16,10 +18,10 @@ def test_a_servo_that_has_restarted_ends_what_would_move_it() -> None:
     rig = Rig()
     rig.driver.restarted.add(1)
     rig.doubt(1)
-    told = rig.submit(plan=three_reads(), node=1, motion=True)
+    results = rig.submit(plan=three_reads(), node=1, kind=JobKind.MOTION)
     assert rig.answer() == FENCE
-    assert isinstance(told[0], NotEnabled)
-    assert "arm: the servo has restarted" in str(told[0])
+    assert isinstance(results[0], NotEnabled)
+    assert "arm: the servo has restarted" in str(results[0])
     assert (rig.restarts, rig.next()) == ([1], b"")
 
 
@@ -27,9 +29,9 @@ def test_a_servo_that_has_restarted_can_still_be_asked() -> None:
     rig = Rig()
     rig.driver.restarted.add(1)
     rig.doubt(1)
-    told = rig.submit(read(1, 5))
+    results = rig.submit(read(1, 5))
     assert [rig.answer(), rig.answer(42)] == [FENCE, ask(5)]
-    assert (rig.restarts, told) == ([1], [42])
+    assert (rig.restarts, results) == ([1], [42])
 
 
 def test_a_goal_under_way_is_not_repeated_to_a_servo_that_has_restarted() -> None:
@@ -57,18 +59,18 @@ def _confirmed_turn(rig: Rig) -> Any:
 
 def test_an_estop_comes_between_the_frames_of_a_plan_which_goes_on_afterwards() -> None:
     rig = Rig()
-    told = rig.submit(plan=three_reads(), node=1)
+    results = rig.submit(plan=three_reads(), node=1)
     assert rig.answer(1) == ask(10)
-    urgent = [rig.runner.urgent]
+    pending = [rig.engine.estop_pending]
     stopped = rig.estop(stop_plan(2))
-    urgent.append(rig.runner.urgent)
+    pending.append(rig.engine.estop_pending)
     assert rig.answer() == ask(100)
-    urgent.append(rig.runner.urgent)
+    pending.append(rig.engine.estop_pending)
     assert rig.answer() == ask(101)
-    urgent.append(rig.runner.urgent)
-    assert (stopped, urgent) == (["stopped"], [False, True, True, False]), "to its last frame"
+    pending.append(rig.engine.estop_pending)
+    assert (stopped, pending) == (["stopped"], [False, True, True, False]), "to its last frame"
     assert [rig.answer(2), rig.answer(3)] == [ask(11), ask(12)]
-    assert told == [[1, 2, 3]]
+    assert results == [[1, 2, 3]]
 
 
 def test_what_moves_is_ended_by_it_and_tells_its_plan() -> None:
@@ -82,18 +84,18 @@ def test_what_moves_is_ended_by_it_and_tells_its_plan() -> None:
             closed.append(True)
 
     rig = Rig()
-    told = rig.submit(plan=moving(), node=1, motion=True)
+    results = rig.submit(plan=moving(), node=1, kind=JobKind.MOTION)
     assert rig.answer() == ask(10)
     stopped = rig.estop(stop_plan())
     assert rig.answer() == ask(100)
-    assert isinstance(told[0], EStopped)
-    assert str(told[0]).startswith("arm: the e-stop came first")
+    assert isinstance(results[0], EStopped)
+    assert str(results[0]).startswith("arm: the e-stop came first")
     assert (closed, stopped, rig.next()) == ([True], ["stopped"], b"")
 
 
 def test_a_second_estop_waits_for_the_first_and_what_was_suspended_for_both() -> None:
     rig = Rig()
-    told = rig.submit(plan=three_reads(), node=1)
+    results = rig.submit(plan=three_reads(), node=1)
     rig.answer(1)
     first = rig.estop(stop_plan(2))
     assert rig.answer() == ask(100)
@@ -103,39 +105,52 @@ def test_a_second_estop_waits_for_the_first_and_what_was_suspended_for_both() ->
     assert rig.answer() == ask(100)
     assert second == ["stopped"]
     assert [rig.answer(2), rig.answer(3)] == [ask(11), ask(12)]
-    assert told == [[1, 2, 3]]
+    assert results == [[1, 2, 3]]
 
 
 def test_an_estop_may_come_while_a_fence_is_out_and_the_fence_goes_on() -> None:
     rig = Rig()
     rig.doubt(2)
-    told = rig.submit(read(2, 5))
-    assert rig.runner.next_request(rig.now) is not None
+    results = rig.submit(read(2, 5))
+    fence = rig.transmit()
+    assert fence is not None
+    assert fence.frame[3:-1] == FENCE
     rig.estop(stop_plan())
-    assert [rig.answer(), rig.answer(), rig.answer(42)] == [ask(100), FENCE, ask(5)]
-    assert told == [42]
+    rig.receive(reply(2, PING, 0).frame)
+    assert [rig.answer(), rig.answer(42)] == [ask(100), ask(5)]
+    assert results == [42]
 
 
 def test_an_estop_names_the_servo_where_there_is_one() -> None:
     rig = Rig()
-    assert str(rig.runner.estopped("elbow")).startswith("arm/elbow:")
+    assert str(rig.engine.estopped("elbow")).startswith("arm/elbow:")
 
 
 # The line
 
 
-def test_a_line_that_never_falls_quiet_ends_what_is_under_way_but_no_estop() -> None:
+def babble(rig: Rig, seconds: float) -> None:
+    """Bytes arrive without a pause for that long, and the engine is asked for its next action after each."""
+    end = rig.now + seconds
+    while rig.now < end:
+        rig.receive(b"\x00")
+        rig.engine.next_action(rig.now)
+
+
+def test_a_line_that_never_falls_silent_fails_a_plan_but_no_estop() -> None:
     rig = Rig()
-    rig.runner.babbled()
-    told = rig.submit(plan=three_reads(), node=1)
-    rig.answer()
-    rig.runner.babbled()
-    assert isinstance(told[0], ReplyTimeout)
-    assert "never falls quiet" in str(told[0])
+    babble(rig, 0.3)
+    assert rig.line.babbling, "nothing was under way"
+    rig.now += 1.0
+    results = rig.submit(plan=three_reads(), node=1)
+    assert rig.answer() == ask(10)
+    babble(rig, 0.3)
+    assert isinstance(results[0], ReplyTimeout)
+    assert "never falls silent" in str(results[0])
     stopped = rig.estop(stop_plan(2))
-    rig.answer()
-    rig.runner.babbled()
-    rig.answer()
+    for _ in range(2):
+        rig.receive(b"\x00")
+        assert rig.answer()[0] == READ
     assert stopped == ["stopped"]
 
 
@@ -148,15 +163,15 @@ def test_a_lost_line_ends_everything() -> None:
     running, second = rig.estop(stop_plan(2)), rig.estop(stop_plan())
     rig.answer()
     rig.coalescer.put(ticket(1, ended))
-    rig.runner.lost("unplugged")
-    assert [len(told) for told in (suspended, waiting, running, second, ended)] == [1, 1, 1, 1, 1]
-    assert {type(told[0]) for told in (suspended, waiting, running, second)} == {LinkDown}
+    rig.engine.lost(LinkDown("unplugged"))
+    assert [len(results) for results in (suspended, waiting, running, second, ended)] == [1, 1, 1, 1, 1]
+    assert {type(results[0]) for results in (suspended, waiting, running, second)} == {LinkDown}
     assert "unplugged" in str(running[0])
     assert "may have been applied" in str(running[0])
     assert "nothing was sent" in str(waiting[0])
     assert isinstance(ended[0][1], LinkDown)
-    assert (rig.runner.idle, rig.next(), rig.scheduler.waiting()) == (True, b"", 0)
-    rig.runner.lost("again")
+    assert (rig.engine.idle, rig.next(), rig.scheduler.waiting()) == (True, b"", 0)
+    rig.engine.lost(LinkDown("again"))
 
 
 # Strays
@@ -166,22 +181,22 @@ def test_a_stray_makes_its_node_doubtful_and_is_remembered() -> None:
     rig = Rig()
     rig.submit(read(1, 5))
     rig.hear(reply(2, READ, 9).frame, reply(1, READ, 7).frame)
-    assert [rig.node(number).condition for number in (1, 2, 3)] == ["online", "doubtful", "online"]
+    assert [rig.node(number).health for number in (1, 2, 3)] == ["online", "doubtful", "online"]
     assert list(rig.node(2).outstanding) == [READ | ANSWER]
-    assert rig.stats.counts["strays"] == 1
+    assert rig.stats.counts[Counter.STRAYS] == 1
 
 
 def test_a_stray_of_a_node_nobody_asked_or_configured_is_only_counted() -> None:
     rig = Rig()
-    rig.runner.strays([reply(77, READ, 9)], None, rig.now)
-    assert (rig.node(77).condition, rig.stats.counts["strays"]) == ("online", 1)
+    rig.engine.receive(reply(77, READ, 9).frame, rig.now)
+    assert (rig.node(77).health, rig.stats.counts[Counter.STRAYS]) == ("online", 1)
 
 
 def test_a_doubled_answer_of_a_node_that_is_looked_for_makes_it_doubtful() -> None:
     rig = Rig()
-    rig.submit(read(77, 5), urgent=True)
+    rig.submit(read(77, 5), even_if_offline=True)
     rig.hear(reply(77, READ, 9).frame * 2)
-    assert rig.node(77).condition == "doubtful"
+    assert rig.node(77).health == "doubtful"
 
 
 def test_a_late_reply_teaches_and_stays_outstanding_from_when_it_was_asked_for() -> None:
@@ -189,6 +204,6 @@ def test_a_late_reply_teaches_and_stays_outstanding_from_when_it_was_asked_for()
     rig.submit(read(1, 5), tries=1)
     rig.miss()
     rig.now += 0.05
-    rig.runner.strays([reply(1, READ, 9)], None, rig.now)
-    assert rig.node(1).deadline > 0.05
+    rig.engine.receive(reply(1, READ, 9).frame, rig.now)
+    assert rig.node(1).reply_allowance_s > 0.05
     assert rig.node(1).outstanding == {READ | ANSWER: 1.0}

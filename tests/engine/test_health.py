@@ -1,130 +1,130 @@
-"""Health: how long a node is waited for, when it is believed, and how often a silent one is looked for."""
+"""Health: how long a reply is waited for, when a node is believed, and how often a silent one is probed."""
 
 from __future__ import annotations
 
 import pytest
 
 from servobus.engine.health import (
+    FIRST_ALLOWANCE,
     FIRST_BACKOFF,
-    FIRST_DEADLINE,
+    MAX_ALLOWANCE,
     MAX_BACKOFF,
-    MAX_DEADLINE,
     MAX_OUTSTANDING,
-    MIN_DEADLINE,
+    MIN_ALLOWANCE,
     OFFLINE_AFTER,
-    Condition,
-    Health,
     Node,
+    NodeTable,
 )
+from servobus.values import Health
 
-ONLINE, DOUBTFUL, OFFLINE = Condition.ONLINE, Condition.DOUBTFUL, Condition.OFFLINE
+ONLINE, DOUBTFUL, OFFLINE = Health.ONLINE, Health.DOUBTFUL, Health.OFFLINE
 
 
 class Watched:
-    """The health of nodes 1 and 2, and all changes that were told."""
+    """The health of nodes 1 and 2, and all changes that were reported."""
 
-    def __init__(self, *, online: bool = True, greatest: float = MAX_DEADLINE) -> None:
-        self.changes: list[tuple[int, Condition, Condition]] = []
-        self.health = Health((1, 2), greatest_deadline=greatest, changed=self._changed)
+    def __init__(self, *, online: bool = True, max_allowance_s: float = MAX_ALLOWANCE) -> None:
+        self.changes: list[tuple[int, Health, Health]] = []
+        self.nodes = NodeTable((1, 2), max_allowance_s=max_allowance_s, changed=self._changed)
         if online:
-            self.health.recovered(self.node)
-            self.health.recovered(self.health.node(2))
+            self.nodes.fenced(self.node)
+            self.nodes.fenced(self.nodes.node(2))
             self.changes.clear()
 
-    def _changed(self, node: Node, before: Condition) -> None:
-        self.changes.append((node.id, before, node.condition))
+    def _changed(self, node: Node, before: Health) -> None:
+        self.changes.append((node.id, before, node.health))
 
     @property
     def node(self) -> Node:
-        return self.health.node(1)
+        return self.nodes.node(1)
 
     def miss(self, times: int = 1, now: float = 0.0) -> None:
         for _ in range(times):
-            self.health.missed(self.node, "key", now, now)
+            self.nodes.missed(self.node, "key", now, now)
 
 
-# Deadlines
+# Allowances
 
 
-def test_a_node_nobody_has_heard_is_given_the_first_deadline_or_less() -> None:
-    assert Watched().node.deadline == FIRST_DEADLINE
-    assert Watched(greatest=0.01).node.deadline == 0.01
+def test_a_node_that_never_replied_has_the_first_allowance_or_less() -> None:
+    assert Watched().node.reply_allowance_s == FIRST_ALLOWANCE
+    assert Watched(max_allowance_s=0.01).node.reply_allowance_s == 0.01
 
 
-def test_the_deadline_is_learned_and_stays_within_its_bounds() -> None:
+def test_the_allowance_is_learned_and_stays_within_its_bounds() -> None:
     node = Watched().node
     for _ in range(100):
         node.learn(0.0001)
-    assert node.deadline == MIN_DEADLINE
+    assert node.reply_allowance_s == MIN_ALLOWANCE
     for _ in range(100):
         node.learn(0.02)
-    assert 0.02 <= node.deadline < 0.021
+    assert 0.02 <= node.reply_allowance_s < 0.021
     for _ in range(100):
         node.learn(5.0)
-    assert node.deadline == MAX_DEADLINE
+    assert node.reply_allowance_s == MAX_ALLOWANCE
 
 
 def test_the_first_answer_sets_mean_and_spread_and_a_jittery_node_is_given_more() -> None:
     steady, jittery = Watched().node, Watched().node
     steady.learn(0.01)
-    assert steady.deadline == pytest.approx(0.01 + 4 * 0.005)
+    assert steady.reply_allowance_s == pytest.approx(0.01 + 4 * 0.005)
     for step in range(200):
         steady.learn(0.01)
         jittery.learn(0.01 + 0.004 * (step % 2))
-    assert jittery.deadline > steady.deadline + 0.004
+    assert jittery.reply_allowance_s > steady.reply_allowance_s + 0.004
 
 
 def test_an_answer_that_came_before_it_could_counts_as_immediate() -> None:
     node = Watched().node
     node.learn(-3.0)
-    assert node.deadline == MIN_DEADLINE
+    assert node.reply_allowance_s == MIN_ALLOWANCE
 
 
-def test_the_greatest_deadline_of_a_config_holds_even_below_the_least() -> None:
-    node = Watched(greatest=0.002).node
+def test_the_maximum_of_a_config_holds_even_below_the_minimum() -> None:
+    node = Watched(max_allowance_s=0.002).node
     node.learn(0.0001)
-    assert node.deadline == 0.002
+    assert node.reply_allowance_s == 0.002
 
 
-def test_a_miss_doubles_the_deadline_up_to_the_greatest() -> None:
-    watched = Watched(greatest=0.03)
+def test_a_miss_doubles_the_allowance_up_to_the_maximum() -> None:
+    watched = Watched(max_allowance_s=0.03)
     watched.miss()
-    assert watched.node.deadline == 0.03, "twice 20 ms is more than is allowed"
+    assert watched.node.reply_allowance_s == 0.03, "twice 20 ms is more than is allowed"
     watched = Watched()
     watched.miss()
-    assert watched.node.deadline == 2 * FIRST_DEADLINE
+    assert watched.node.reply_allowance_s == 2 * FIRST_ALLOWANCE
 
 
 def test_a_late_reply_teaches_how_long_it_took() -> None:
     watched = Watched()
     watched.miss(now=1.0)
     watched.node.late("unknown", 1.01)
-    assert watched.node.deadline == 2 * FIRST_DEADLINE, "of an answer nobody gave up nothing is learned"
+    assert watched.node.reply_allowance_s == 2 * FIRST_ALLOWANCE, "of an answer nobody gave up nothing is learned"
     watched.node.late("key", 1.03)
-    assert watched.node.deadline == pytest.approx(0.03 + 4 * 0.015)
+    assert watched.node.reply_allowance_s == pytest.approx(0.03 + 4 * 0.015)
 
 
-# Conditions
+# Healths
 
 
 def test_a_configured_node_is_doubtful_until_a_fence_was_answered() -> None:
     watched = Watched(online=False)
-    assert watched.node.condition is DOUBTFUL
-    assert watched.health.reachable() == []
-    watched.health.recovered(watched.node)
+    assert watched.node.health is DOUBTFUL
+    assert watched.nodes.reachable() == []
+    watched.nodes.fenced(watched.node)
     assert watched.changes == [(1, DOUBTFUL, ONLINE)]
-    assert watched.health.reachable() == [1]
+    assert watched.nodes.reachable() == [1]
 
 
 def test_it_is_doubtful_after_one_miss_and_offline_after_three() -> None:
     watched = Watched()
     for missed in range(1, OFFLINE_AFTER):
         watched.miss()
-        assert (watched.node.condition, watched.node.misses) == (DOUBTFUL, missed)
+        assert (watched.node.health, watched.node.misses) == (DOUBTFUL, missed)
     watched.miss()
     assert watched.changes == [(1, ONLINE, DOUBTFUL), (1, DOUBTFUL, OFFLINE)]
-    assert watched.node.deadline == FIRST_DEADLINE
-    assert watched.health.reachable() == [2]
+    assert watched.node.reply_allowance_s == FIRST_ALLOWANCE
+    assert watched.nodes.reachable() == [2]
 
 
 def test_an_answer_between_two_misses_keeps_it_from_going_offline() -> None:
@@ -132,24 +132,24 @@ def test_an_answer_between_two_misses_keeps_it_from_going_offline() -> None:
     for _ in range(10):
         watched.miss(OFFLINE_AFTER - 1)
         watched.node.answered(0x20)
-    assert watched.node.condition is DOUBTFUL
+    assert watched.node.health is DOUBTFUL
     assert watched.node.status == 0x20
 
 
-def test_only_changes_are_told() -> None:
+def test_only_changes_are_reported() -> None:
     watched = Watched()
     watched.miss(OFFLINE_AFTER + 2)
-    watched.health.recovered(watched.node)
-    watched.health.recovered(watched.node)
+    watched.nodes.fenced(watched.node)
+    watched.nodes.fenced(watched.node)
     assert watched.changes == [(1, ONLINE, DOUBTFUL), (1, DOUBTFUL, OFFLINE), (1, OFFLINE, ONLINE)]
 
 
 def test_a_reply_too_many_makes_an_online_node_doubtful_and_due_for_a_probe() -> None:
     watched = Watched()
-    watched.health.doubt(watched.node, "key", 3.0)
+    watched.nodes.doubt(watched.node, "key", 3.0)
     assert watched.changes == [(1, ONLINE, DOUBTFUL)]
-    assert watched.health.due_probe(2.999) is None
-    assert watched.health.due_probe(3.0) is watched.node
+    assert watched.nodes.due_probe(2.999) is None
+    assert watched.nodes.due_probe(3.0) is watched.node
     assert watched.node.misses == 0
 
 
@@ -157,8 +157,8 @@ def test_a_reply_too_many_does_not_bring_an_offline_node_nearer() -> None:
     watched = Watched()
     watched.miss(OFFLINE_AFTER)
     due = watched.node.next_probe
-    watched.health.doubt(watched.node, "key", 0.001)
-    assert (watched.node.condition, watched.node.next_probe) == (OFFLINE, due)
+    watched.nodes.doubt(watched.node, "key", 0.001)
+    assert (watched.node.health, watched.node.next_probe) == (OFFLINE, due)
 
 
 # What may still come
@@ -167,9 +167,9 @@ def test_a_reply_too_many_does_not_bring_an_offline_node_nearer() -> None:
 def test_replies_that_may_still_come_are_kept_oldest_first_and_forgotten_by_a_fence() -> None:
     watched = Watched()
     for key, asked_at in (("a", 1.0), ("b", 2.0), ("a", 3.0)):
-        watched.health.doubt(watched.node, key, asked_at)
+        watched.nodes.doubt(watched.node, key, asked_at)
     assert list(watched.node.outstanding.items()) == [("b", 2.0), ("a", 3.0)]
-    watched.health.recovered(watched.node)
+    watched.nodes.fenced(watched.node)
     assert watched.node.outstanding == {}
 
 
@@ -188,7 +188,7 @@ def test_no_more_than_so_many_are_kept() -> None:
 def test_a_doubtful_node_is_probed_at_once_and_an_offline_one_ever_more_seldom() -> None:
     watched, now, pauses = Watched(), 0.0, []
     watched.miss(OFFLINE_AFTER - 1, now=5.0)
-    assert watched.health.due_probe(5.0) is watched.node
+    assert watched.nodes.due_probe(5.0) is watched.node
     for _ in range(9):
         watched.miss(now=now)
         pauses.append(watched.node.next_probe - now)
@@ -201,50 +201,50 @@ def test_a_doubtful_node_is_probed_at_once_and_an_offline_one_ever_more_seldom()
 def test_after_it_came_back_the_backoff_starts_anew() -> None:
     watched = Watched()
     watched.miss(OFFLINE_AFTER + 4)
-    watched.health.recovered(watched.node)
-    assert watched.health.next_probe() is None
+    watched.nodes.fenced(watched.node)
+    assert watched.nodes.next_probe() is None
     watched.miss(OFFLINE_AFTER, now=7.0)
     assert watched.node.next_probe == 7.0 + FIRST_BACKOFF
 
 
 def test_the_one_that_has_waited_longest_is_probed_first() -> None:
     watched = Watched()
-    second = watched.health.node(2)
-    watched.health.missed(second, "key", 1.0, 1.0)
+    second = watched.nodes.node(2)
+    watched.nodes.missed(second, "key", 1.0, 1.0)
     watched.miss(now=2.0)
-    assert watched.health.next_probe() == 1.0
-    assert watched.health.due_probe(0.5) is None
-    assert watched.health.due_probe(2.0) is second
+    assert watched.nodes.next_probe() == 1.0
+    assert watched.nodes.due_probe(0.5) is None
+    assert watched.nodes.due_probe(2.0) is second
 
 
 def test_a_late_reply_of_an_offline_node_brings_its_probe_forward() -> None:
     watched = Watched()
     watched.miss(OFFLINE_AFTER)
     watched.node.late("key", 0.01)
-    assert watched.health.due_probe(0.01) is watched.node
+    assert watched.nodes.due_probe(0.01) is watched.node
 
 
-def test_a_node_nobody_configured_is_known_but_never_probed() -> None:
+def test_a_node_that_is_not_configured_is_never_probed() -> None:
     watched = Watched()
-    stranger = watched.health.node(9)
-    assert stranger is watched.health.node(9)
-    assert stranger.condition is ONLINE, "nothing was asked of it, so nothing can be under way"
+    stranger = watched.nodes.node(9)
+    assert stranger is watched.nodes.node(9)
+    assert stranger.health is ONLINE, "nothing was asked of it, so nothing can be under way"
     for _ in range(OFFLINE_AFTER):
-        watched.health.missed(stranger, "key", 0.0, 0.0)
-    assert (stranger.condition, watched.changes[-1]) == (OFFLINE, (9, DOUBTFUL, OFFLINE))
-    assert watched.health.next_probe() is None
-    assert watched.health.due_probe(100.0) is None
+        watched.nodes.missed(stranger, "key", 0.0, 0.0)
+    assert (stranger.health, watched.changes[-1]) == (OFFLINE, (9, DOUBTFUL, OFFLINE))
+    assert watched.nodes.next_probe() is None
+    assert watched.nodes.due_probe(100.0) is None
 
 
 def test_after_the_line_was_gone_everybody_is_asked_before_being_believed() -> None:
     watched = Watched()
-    second = watched.health.node(2)
+    second = watched.nodes.node(2)
     for _ in range(OFFLINE_AFTER + 3):
-        watched.health.missed(second, "key", 50.0, 50.0)
+        watched.nodes.missed(second, "key", 50.0, 50.0)
     watched.changes.clear()
-    watched.health.suspect_all()
+    watched.nodes.suspect_all()
     assert watched.changes == [(1, ONLINE, DOUBTFUL)]
-    assert (second.condition, second.backoff) == (OFFLINE, 0.0)
-    assert watched.health.next_probe() == 0.0
+    assert (second.health, second.backoff) == (OFFLINE, 0.0)
+    assert watched.nodes.next_probe() == 0.0
     assert watched.node.next_probe == second.next_probe == 0.0
     assert second.outstanding, "what was under way may come yet"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from servobus.engine.queue import Callback, Job, RequestQueue, overloaded
+from servobus.engine.job import Callback, Job
+from servobus.engine.queue import RequestQueue, overloaded
 from servobus.errors import LinkDown, Overloaded, ReplyTimeout
 from servobus.protocols.base import Plan
 from tests.engine.toy_protocol import Sink, read
@@ -105,12 +106,12 @@ def test_a_job_waits_until_it_expires_and_not_at_it() -> None:
     assert error.raw == read(2).frame
 
 
-def test_a_job_that_was_said_already_says_so_when_it_expires() -> None:
-    said = job(1)
-    said.attempts = 1
-    queue = queue_of(said)
+def test_a_job_that_was_sent_already_says_so_when_it_expires() -> None:
+    sent = job(1)
+    sent.attempts = 1
+    queue = queue_of(sent)
     assert queue.take(1.0) is None
-    assert "may have been applied" in str(sink(said).results[0])
+    assert "may have been applied" in str(sink(sent).results[0])
 
 
 def test_expire_fails_what_stands_first_and_is_too_old() -> None:
@@ -152,9 +153,9 @@ def test_remove_takes_out_what_is_unwanted_in_order() -> None:
     assert drain(queue) == [jobs[1]]
 
 
-def test_a_callback_is_told_once() -> None:
-    told: list[object] = []
-    good, bad = Callback(told.append), Callback(told.append)
+def test_a_callback_is_called_once() -> None:
+    results: list[object] = []
+    good, bad = Callback(results.append), Callback(results.append)
     assert not good.done()
     waiting = Job(good, 1.0, request=read(1))
     waiting.succeed(5)
@@ -164,7 +165,7 @@ def test_a_callback_is_told_once() -> None:
     failed = Job(bad, 1.0, request=read(1))
     failed.fail(error)
     failed.fail(error)
-    assert told == [5, error]
+    assert results == [5, error]
 
 
 def test_overload_says_how_many_wait() -> None:

@@ -1,4 +1,4 @@
-"""Speed by the host: the row of setpoints, its pace, and everything that ends it."""
+"""Speed by the host: the ramp of setpoints, its speed, and everything that ends it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ HZ = 10.0
 class Bench:
     def __init__(self) -> None:
         self.cuts: list[tuple[str, Exception]] = []
-        self.profile = SetpointRamps(HZ, lambda servo, error: self.cuts.append((servo, error)))
+        self.setpoint: float | None = None
+        """As the servo's record keeps it."""
+        self.ramps = SetpointRamps(HZ, lambda servo, error: self.cuts.append((servo, error)), self._sent)
         self.results: list[Any] = []
 
     def ticket(self, target: float, start: float | None = 0.0, *, now: float = 0.0) -> Ticket:
@@ -26,73 +28,76 @@ class Bench:
 
     def begin(self, target: float, start: float | None = 0.0, *, speed: float = 100.0, now: float = 0.0) -> Ticket:
         ticket = self.ticket(target, start, now=now)
-        self.profile.begin(ticket, speed, now)
+        self.ramps.begin(ticket, speed, start if self.setpoint is None else self.setpoint, now)
         return ticket
 
+    def _sent(self, servo: str, setpoint: float) -> None:
+        self.setpoint = setpoint
+
     def run(self, ticket: Ticket, until: float = 10.0) -> list[tuple[float, float]]:
-        """(time, setpoint) of the whole row, each delivered at once."""
+        """(time, setpoint) of the whole ramp, each delivered at once."""
         row = [(0.0, ticket.goal.goal.value)]
         ticket.done(Outcome.ACKED)
-        while (due := self.profile.next_due()) is not None and due < until:
-            for following in self.profile.due(due):
+        while (due := self.ramps.next_due()) is not None and due < until:
+            for following in self.ramps.due(due):
                 row.append((round(due, 6), round(following.goal.goal.value, 6)))
                 following.done(Outcome.ACKED)
         return row
 
 
-def test_a_goal_becomes_a_row_of_setpoints_on_the_cycle() -> None:
+def test_a_goal_becomes_a_ramp_of_setpoints_on_the_cycle() -> None:
     bench = Bench()
     assert bench.run(bench.begin(35)) == [(0.0, 10), (0.1, 20), (0.2, 30), (0.3, 35)]
     assert bench.results == [Outcome.ACKED], "the caller's ticket is the first setpoint's"
-    assert bench.profile.next_due() is None
+    assert bench.ramps.next_due() is None
 
 
 @pytest.mark.parametrize("target", [-25.0, -10.0, 0.0, 10.0, 10.000001, 25.0])
 def test_no_step_is_longer_than_one_cycle_at_that_speed(target: float) -> None:
     bench = Bench()
-    places = [0.0, *(place for _, place in bench.run(bench.begin(target)))]
-    assert places[-1] == target
-    assert max(abs(one - other) for one, other in pairwise(places)) <= 100 / HZ
+    setpoints = [0.0, *(setpoint for _, setpoint in bench.run(bench.begin(target)))]
+    assert setpoints[-1] == target
+    assert max(abs(one - other) for one, other in pairwise(setpoints)) <= 100 / HZ
 
 
 def test_the_first_setpoint_may_be_the_last() -> None:
     bench = Bench()
     ticket = bench.begin(10)
     assert ticket.goal.goal.value == 10
-    assert bench.profile.leads("a")
+    assert "a" in bench.ramps.active
     ticket.done(Outcome.ACKED)
-    assert bench.profile.next_due() is None
-    assert not bench.profile.leads("a")
+    assert bench.ramps.next_due() is None
+    assert "a" not in bench.ramps.active
 
 
 def test_a_late_cycle_is_not_caught_up_with() -> None:
     bench = Bench()
     bench.begin(100).done(Outcome.ACKED)
-    (ticket,) = bench.profile.due(5.0)
+    (ticket,) = bench.ramps.due(5.0)
     assert ticket.goal.goal.value == 20
     assert ticket.expires == 5.2
-    assert bench.profile.due(5.0) == []
-    assert bench.profile.next_due() == pytest.approx(5.1)
+    assert bench.ramps.due(5.0) == []
+    assert bench.ramps.next_due() == pytest.approx(5.1)
 
 
 def test_nothing_follows_before_the_first_was_delivered() -> None:
     bench = Bench()
     ticket = bench.begin(50)
-    assert bench.profile.due(9.0) == []
+    assert bench.ramps.due(9.0) == []
     ticket.done(ReplyTimeout("lost"))
-    assert bench.profile.due(9.0) == []
+    assert bench.ramps.due(9.0) == []
     assert isinstance(bench.results[0], ReplyTimeout)
-    assert bench.cuts == [], "the caller was told"
+    assert bench.cuts == [], "the caller has the error"
 
 
-def test_a_setpoint_that_fails_ends_the_row_and_is_told() -> None:
+def test_a_setpoint_that_fails_ends_the_ramp_and_is_reported() -> None:
     bench = Bench()
     bench.begin(50).done(Outcome.ACKED)
-    (ticket,) = bench.profile.due(0.1)
+    (ticket,) = bench.ramps.due(0.1)
     error = ReplyTimeout("lost")
     ticket.done(error)
     assert bench.cuts == [("a", error)]
-    assert bench.profile.next_due() is None
+    assert bench.ramps.next_due() is None
     ticket.done(error)
     assert len(bench.cuts) == 1
 
@@ -100,21 +105,21 @@ def test_a_setpoint_that_fails_ends_the_row_and_is_told() -> None:
 def test_a_superseded_setpoint_ends_nothing() -> None:
     bench = Bench()
     bench.begin(50).done(Outcome.ACKED)
-    (ticket,) = bench.profile.due(0.1)
+    (ticket,) = bench.ramps.due(0.1)
     ticket.done(Outcome.SUPERSEDED)
-    assert bench.profile.next_due() == pytest.approx(0.2)
+    assert bench.ramps.next_due() == pytest.approx(0.2)
 
 
 def test_a_newer_goal_goes_on_from_the_last_setpoint() -> None:
     bench = Bench()
     older = bench.begin(50)
     older.done(Outcome.ACKED)
-    bench.profile.due(0.1)
+    bench.ramps.due(0.1)
     newer = bench.begin(-50, start=0.0, now=0.15)
-    assert newer.goal.goal.value == 10, "from 20, where it was last sent, and not from where it was seen"
-    assert bench.profile.due(0.2) == [], "the older row has ended"
+    assert newer.goal.goal.value == 10, "from 20, where it was last sent, and not from where it was read"
+    assert bench.ramps.due(0.2) == [], "the older ramp has ended"
     newer.done(Outcome.ACKED)
-    assert bench.profile.next_due() == pytest.approx(0.25)
+    assert bench.ramps.next_due() == pytest.approx(0.25)
 
 
 def test_a_caller_replaced_before_its_first_setpoint_left() -> None:
@@ -123,25 +128,25 @@ def test_a_caller_replaced_before_its_first_setpoint_left() -> None:
     newer = bench.begin(-50)
     older.done(Outcome.SUPERSEDED)
     newer.done(Outcome.ACKED)
-    assert [ticket.goal.goal.value for ticket in bench.profile.due(0.1)] == [-20]
+    assert [ticket.goal.goal.value for ticket in bench.ramps.due(0.1)] == [-20]
 
 
-def test_dropped_and_forgotten() -> None:
+def test_a_dropped_ramp_ends_and_the_next_one_starts_at_the_last_setpoint() -> None:
     bench = Bench()
     bench.begin(50).done(Outcome.ACKED)
-    (late,) = bench.profile.due(0.1)
-    bench.profile.drop()
-    assert bench.profile.next_due() is None
+    (late,) = bench.ramps.due(0.1)
+    bench.ramps.drop()
+    assert bench.ramps.next_due() is None
     late.done(ReplyTimeout("lost"))
     assert bench.cuts == [], "it had ended before"
-    assert bench.begin(50, start=3.0).goal.goal.value == 30, "where it was last sent stays known"
-    bench.profile.forget("a")
+    assert bench.begin(50, start=3.0).goal.goal.value == 30, "the record still has the last setpoint"
+    bench.setpoint = None
     assert bench.begin(50, start=3.0).goal.goal.value == 13
-    bench.profile.drop({"a", "b"})
-    assert bench.profile.next_due() is None
+    bench.ramps.drop({"a", "b"})
+    assert bench.ramps.next_due() is None
 
 
-def test_a_start_nobody_knows() -> None:
+def test_a_goal_without_a_start_is_sent_as_it_is() -> None:
     bench = Bench()
     assert bench.begin(50, start=None).goal.goal.value == 50
-    assert bench.profile.next_due() is None
+    assert bench.ramps.next_due() is None

@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 
 from servobus.engine.health import MAX_BACKOFF
+from servobus.engine.job import Job, JobKind
 from servobus.engine.polls import PollTimer
-from servobus.engine.queue import Job
 from servobus.engine.scheduler import POLL_PATIENCE, PROBE_PAUSE
 from servobus.errors import DeviceError, EStopped, Overloaded, ReplyTimeout
 from servobus.protocols.base import run_plan
@@ -21,11 +21,11 @@ from tests.engine.toy_protocol import ANSWER, READ, Bench, poll, ticket
 
 def test_the_classes_go_in_their_order() -> None:
     bench, ended = Bench(1, 2, 3), Ended()
-    bench.health.missed(bench.node(3), READ, 0.0, 0.0)
-    bench.scheduler.polls.set([poll("feedback", 50, 1)], 0.0)
-    bench.scheduler.submit(job(2), 0.0)
+    bench.nodes.missed(bench.node(3), READ, 0.0, 0.0)
+    bench.scheduler.set_polls([poll("feedback", 50, 1)], 0.0)
+    bench.scheduler.queue(job(2), 0.0)
     bench.coalescer.put(ticket(1, ended))
-    bench.scheduler.estop.append(stop_job())
+    bench.scheduler.put_stop(stop_job())
     assert [kind(bench.scheduler.next_job(0.0)) for _ in range(5)] == ["estop", "goal", "request", "poll", "probe"]
 
 
@@ -68,7 +68,7 @@ def test_after_a_pause_nobody_is_owed_a_turn() -> None:
 def test_an_estop_is_never_owed_to_anybody() -> None:
     flood = Flood("goal", "request")
     for _ in range(5):
-        flood.bench.scheduler.estop.append(stop_job())
+        flood.bench.scheduler.put_stop(stop_job())
     assert flood.kinds(7) == ["estop"] * 5 + ["goal", "request"]
 
 
@@ -96,7 +96,7 @@ def test_a_grid_point_that_is_now_belongs_to_this_poll() -> None:
 
 def test_polls_of_one_rate_are_spread_over_their_period() -> None:
     bench = Bench(1, 2)
-    bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
+    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
     assert bench.scheduler.wake() == 5.0
     assert kind(bench.scheduler.next_job(5.0)) == "poll"
     assert bench.scheduler.next_job(5.049) is None
@@ -112,19 +112,19 @@ def test_polls_of_one_rate_are_spread_over_their_period() -> None:
 
 def test_missed_polls_are_counted_and_the_count_survives_new_polls() -> None:
     bench = Bench(1)
-    bench.scheduler.polls.set([poll("a", 10, 1)], 0.0)
+    bench.scheduler.set_polls([poll("a", 10, 1)], 0.0)
     assert kind(bench.scheduler.next_job(0.55)) == "poll"
     assert bench.scheduler.polls.missed == 5
-    bench.scheduler.polls.set([poll("a", 10, 1)], 1.0)
+    bench.scheduler.set_polls([poll("a", 10, 1)], 1.0)
     assert bench.scheduler.polls.missed == 5
-    bench.scheduler.polls.set([], 1.0)
+    bench.scheduler.set_polls([], 1.0)
     assert (bench.scheduler.polls.missed, bench.scheduler.wake()) == (5, None)
 
 
 def test_a_poll_of_nobody_who_can_be_reached_costs_no_turn() -> None:
     bench = Bench(1, 2)
     bench.take_offline(1)
-    bench.scheduler.polls.set([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
+    bench.scheduler.set_polls([poll("a", 10, 1), poll("b", 10, 1, 2)], 0.0)
     taken = bench.scheduler.next_job(0.05)
     assert taken is not None
     assert taken.request is not None
@@ -138,11 +138,11 @@ def test_a_doubtful_node_is_probed_and_believed_again() -> None:
     bench = Bench(1, online=False)
     taken = bench.scheduler.next_job(0.0)
     assert taken is not None
-    assert (taken.recovery, taken.node) == (True, 1)
+    assert (taken.kind, taken.node) == (JobKind.PROBE, 1)
     assert taken.plan is not None
     assert run_plan(taken.plan, lambda _: None) is True
     taken.succeed(True)
-    assert bench.node(1).condition == "online"
+    assert bench.node(1).health == "online"
     assert (bench.restarts, bench.scheduler.next_job(0.0)) == ([], None)
 
 
@@ -180,13 +180,13 @@ def test_in_an_exclusive_session_only_its_requests_and_the_estop_go() -> None:
     flood = Flood("goal", "request", "poll", "probe")
     flood.kinds(3)
     scheduler = flood.bench.scheduler
-    scheduler.session = session = object()
+    session = scheduler.open_session()
     ours, stop = job(2, session=session), stop_job()
-    scheduler.submit(ours, flood.now)
-    scheduler.estop.append(stop)
+    scheduler.queue(ours, flood.now)
+    scheduler.put_stop(stop)
     assert [flood.turn() for _ in range(3)] == [stop, ours, None]
     assert scheduler.wake() == pytest.approx(1.002), "the first request's end, no probe and no poll"
-    scheduler.session = None
+    scheduler.close_session()
     assert set(flood.kinds(8)) == {"goal", "request", "poll", "probe"}
 
 
@@ -194,18 +194,18 @@ def test_an_estop_drops_what_moves_wherever_it_waits() -> None:
     ended: Ended = []
     bench, _ = split_bench(ended)
     bench.coalescer.put(ticket(1, ended))
-    moving, reading = job(1, motion=True), job(1)
-    parked_moving, parked_reading = job(3, motion=True), job(3)
+    moving, reading = job(1, kind=JobKind.MOTION), job(1)
+    parked_moving, parked_reading = job(3, kind=JobKind.MOTION), job(3)
     for each in (moving, reading):
-        bench.scheduler.submit(each, 0.0)
+        bench.scheduler.queue(each, 0.0)
     bench.take_offline(3)
     for each in (parked_moving, parked_reading):
-        bench.scheduler.submit(each, 0.0)
+        bench.scheduler.queue(each, 0.0)
     bench.scheduler.drop(estopped, motion_only=True)
     assert sorted(servo for servo, _ in ended) == ["s1", "s2", "s3"]
     assert {type(result) for _, result in ended} == {EStopped}
     assert [type(each) for job_ in (moving, parked_moving) for each in results(job_)] == [EStopped, EStopped]
-    bench.health.recovered(bench.node(3))
+    bench.nodes.fenced(bench.node(3))
     assert {bench.scheduler.next_job(0.0), bench.scheduler.next_job(0.0)} == {reading, parked_reading}
     assert bench.scheduler.next_job(0.0) is None
 
@@ -213,11 +213,11 @@ def test_an_estop_drops_what_moves_wherever_it_waits() -> None:
 def test_a_lost_line_ends_everything() -> None:
     ended: Ended = []
     bench, _ = split_bench(ended)
-    jobs = [job(1), job(2, motion=True), job(3)]
+    jobs = [job(1), job(2, kind=JobKind.MOTION), job(3)]
     bench.take_offline(3)
     for each in jobs:
-        bench.scheduler.submit(each, 0.0)
-    bench.scheduler.estop.append(stop := stop_job())
+        bench.scheduler.queue(each, 0.0)
+    bench.scheduler.put_stop(stop := stop_job())
     bench.scheduler.drop(estopped, motion_only=False)
     assert [len(results(each)) for each in (*jobs, stop)] == [1, 1, 1, 1]
     assert len(ended) == 2, "the first frame was taken before"
@@ -230,14 +230,18 @@ def test_a_lost_line_ends_everything() -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) -> None:
     rng, now, limit, nodes = random.Random(seed), 0.0, 8, (1, 2, 3, 4)
-    bench, jobs = Bench(*nodes, limit=limit, most=2), list[Job]()
+    bench, jobs = Bench(*nodes, limit=limit, goals_per_frame=2), list[Job]()
     accepted, ended = Counter[str](), Ended()
-    bench.scheduler.polls.set([poll("feedback", 200, *nodes)], now)
+    bench.scheduler.set_polls([poll("feedback", 200, *nodes)], now)
 
     def submit() -> None:
-        new = job(rng.choice(nodes), expires=now + rng.uniform(0.01, 0.1), motion=rng.random() < 0.2)
+        new = job(
+            rng.choice(nodes),
+            expires=now + rng.uniform(0.01, 0.1),
+            kind=JobKind.MOTION if rng.random() < 0.2 else JobKind.ORDINARY,
+        )
         try:
-            bench.scheduler.submit(new, now)
+            bench.scheduler.queue(new, now)
         except Overloaded:
             return
         jobs.append(new)
@@ -263,9 +267,9 @@ def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) ->
     def node() -> None:
         changed = bench.node(rng.choice(nodes))
         if rng.random() < 0.5:
-            bench.health.missed(changed, READ | ANSWER, now, now)
+            bench.nodes.missed(changed, READ | ANSWER, now, now)
         else:
-            bench.health.recovered(changed)
+            bench.nodes.fenced(changed)
 
     def drop() -> None:
         if rng.random() < 0.05:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from servobus.engine.health import FIRST_DEADLINE
+from servobus.engine.health import FIRST_ALLOWANCE
 from servobus.errors import ActionWithheld, GoalExpired, NotEnabled, NotSupported, Overloaded, ReplyTimeout
 from servobus.values import Outcome
 from tests.engine.scheduled_jobs import Ended, disabled, finish, job, kind, results, split_bench, stop_job
@@ -49,7 +49,7 @@ def test_goals_the_driver_refuses_end_with_its_error_and_the_next_go_on(refusal:
 def test_the_frames_of_a_split_group_leave_one_after_the_other_with_a_lower_turn_between() -> None:
     ended: Ended = []
     bench, first = split_bench(ended)
-    bench.scheduler.submit(job(1), 0.0)
+    bench.scheduler.queue(job(1), 0.0)
     finish(first)
     assert kind(bench.scheduler.next_job(0.0)) == "request"
     finish(bench.scheduler.next_job(0.0))
@@ -78,7 +78,7 @@ def test_a_frame_whose_servo_is_in_doubt_waits_and_newer_goals_replace_it() -> N
     ended: Ended = []
     bench, first = split_bench(ended)
     finish(first)
-    bench.health.missed(bench.node(2), READ | ANSWER, 0.0, 5.0)
+    bench.nodes.missed(bench.node(2), READ | ANSWER, 0.0, 5.0)
     bench.coalescer.put(ticket(3, ended))
     third = bench.scheduler.next_job(0.1)
     finish(third)
@@ -86,7 +86,7 @@ def test_a_frame_whose_servo_is_in_doubt_waits_and_newer_goals_replace_it() -> N
     finish(bench.scheduler.next_job(0.1))
     assert ended[2:] == [("s3", Outcome.SENT)]
     assert bench.scheduler.next_job(0.1) is None
-    bench.health.recovered(bench.node(2))
+    bench.nodes.fenced(bench.node(2))
     finish(bench.scheduler.next_job(0.1))
     assert ended[3:] == [("s2", Outcome.SENT)]
 
@@ -115,13 +115,13 @@ def test_a_group_asked_for_together_is_never_sent_without_one_of_it() -> None:
 
 def test_overload_comes_at_exactly_the_limit() -> None:
     bench = Bench(1, 2, limit=2)
-    bench.scheduler.submit(job(1), 0.0)
-    bench.scheduler.submit(job(1), 0.0)
+    bench.scheduler.queue(job(1), 0.0)
+    bench.scheduler.queue(job(1), 0.0)
     with pytest.raises(Overloaded):
-        bench.scheduler.submit(job(2), 0.0)
+        bench.scheduler.queue(job(2), 0.0)
     assert bench.scheduler.waiting() == 2
     assert bench.scheduler.next_job(0.0) is not None
-    bench.scheduler.submit(job(2), 0.0)
+    bench.scheduler.queue(job(2), 0.0)
 
 
 def test_requests_for_an_offline_node_wait_aside_as_long_as_an_answer_would_take() -> None:
@@ -129,14 +129,14 @@ def test_requests_for_an_offline_node_wait_aside_as_long_as_an_answer_would_take
     bench.take_offline(1)
     waiting = [job(1), job(1)]
     for each in waiting:
-        bench.scheduler.submit(each, 0.0)
+        bench.scheduler.queue(each, 0.0)
     with pytest.raises(Overloaded):
-        bench.scheduler.submit(job(1), 0.0)
-    bench.scheduler.submit(other := job(2), 0.0)
-    assert bench.scheduler.wake() == FIRST_DEADLINE
-    assert bench.scheduler.next_job(FIRST_DEADLINE - 0.001) is other
+        bench.scheduler.queue(job(1), 0.0)
+    bench.scheduler.queue(other := job(2), 0.0)
+    assert bench.scheduler.wake() == FIRST_ALLOWANCE
+    assert bench.scheduler.next_job(FIRST_ALLOWANCE - 0.001) is other
     assert [results(each) for each in waiting] == [[], []]
-    bench.scheduler.expire(FIRST_DEADLINE)
+    bench.scheduler.expire(FIRST_ALLOWANCE)
     for each in waiting:
         (error,) = results(each)
         assert isinstance(error, ReplyTimeout)
@@ -149,11 +149,11 @@ def test_a_busy_line_ends_them_in_time_too() -> None:
     bench = Bench(1, 2)
     bench.take_offline(1)
     waiting, plan_job = job(1), stop_job()
-    bench.scheduler.submit(waiting, 0.0)
-    bench.scheduler.submit(plan_job, 0.0)
+    bench.scheduler.queue(waiting, 0.0)
+    bench.scheduler.queue(plan_job, 0.0)
     for _ in range(3):
-        bench.scheduler.submit(job(2), 0.0)
-    assert kind(bench.scheduler.next_job(FIRST_DEADLINE)) == "request"
+        bench.scheduler.queue(job(2), 0.0)
+    assert kind(bench.scheduler.next_job(FIRST_ALLOWANCE)) == "request"
     assert len(results(waiting)) == len(results(plan_job)) == 1
 
 
@@ -161,30 +161,30 @@ def test_they_are_served_in_order_when_the_node_comes_back() -> None:
     bench = Bench(1, 2)
     queued = [job(1), job(1)]
     for each in queued:
-        bench.scheduler.submit(each, 0.0)
+        bench.scheduler.queue(each, 0.0)
     bench.take_offline(1)
     parked = job(1)
-    bench.scheduler.submit(parked, 0.0)
+    bench.scheduler.queue(parked, 0.0)
     assert bench.scheduler.next_job(0.001) is None
-    bench.health.recovered(bench.node(1))
+    bench.nodes.fenced(bench.node(1))
     assert [bench.scheduler.next_job(0.001) for _ in range(3)] == [*queued, parked]
 
 
 def test_what_was_queued_when_its_node_went_offline_does_not_wait_longer_than_what_comes_then() -> None:
     bench = Bench(1)
     queued = job(1, expires=2.0)
-    bench.scheduler.submit(queued, 0.0)
+    bench.scheduler.queue(queued, 0.0)
     bench.take_offline(1, now=0.5)
-    assert bench.scheduler.wake() == pytest.approx(0.5 + FIRST_DEADLINE)
-    bench.scheduler.expire(0.5 + FIRST_DEADLINE)
+    assert bench.scheduler.wake() == pytest.approx(0.5 + FIRST_ALLOWANCE)
+    bench.scheduler.expire(0.5 + FIRST_ALLOWANCE)
     assert isinstance(results(queued)[0], ReplyTimeout)
 
 
 def test_urgent_requests_are_said_to_an_offline_node() -> None:
     bench = Bench(1)
-    bench.scheduler.submit(before := job(1, urgent=True), 0.0)
+    bench.scheduler.queue(before := job(1, even_if_offline=True), 0.0)
     bench.take_offline(1)
-    bench.scheduler.submit(after := job(1, urgent=True), 0.0)
+    bench.scheduler.queue(after := job(1, even_if_offline=True), 0.0)
     assert bench.scheduler.next_job(0.0) is before
     assert bench.scheduler.next_job(0.0) is after
 
@@ -193,7 +193,7 @@ def test_an_offline_nodes_callers_who_left_are_forgotten() -> None:
     bench = Bench(1)
     bench.take_offline(1)
     waiting = job(1)
-    bench.scheduler.submit(waiting, 0.0)
+    bench.scheduler.queue(waiting, 0.0)
     assert isinstance(waiting.sink, Sink)
     waiting.sink.cancelled = True
     bench.scheduler.expire(0.0)
@@ -204,7 +204,7 @@ def test_a_retried_request_stays_first_of_its_node_and_the_other_nodes_go_before
     bench = Bench(1, 2)
     first, second, other = job(1), job(1), job(2)
     for each in (first, second, other):
-        bench.scheduler.submit(each, 0.0)
+        bench.scheduler.queue(each, 0.0)
     assert bench.scheduler.next_job(0.0) is first
     bench.scheduler.retry(first)
     assert [bench.scheduler.next_job(0.0) for _ in range(3)] == [other, first, second]

@@ -1,4 +1,4 @@
-"""Counters and histograms: figures that are as true as they say."""
+"""Counters and histograms: how exact their figures are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from servobus.engine.stats import SUB_BUCKETS, BusStats, Histogram
+from servobus.engine.stats import SUB_BUCKETS, BusStats, Counter, Histogram
 
 
 def histogram(*durations: float) -> Histogram:
@@ -18,12 +18,12 @@ def histogram(*durations: float) -> Histogram:
 
 def test_an_empty_histogram_has_only_zeros() -> None:
     empty = Histogram()
-    assert (empty.percentile(0.5), empty.greatest, empty.count, list(empty.buckets())) == (0.0, 0.0, 0, [])
+    assert (empty.percentile(0.5), empty.max, empty.count, list(empty.buckets())) == (0.0, 0.0, 0, [])
 
 
 @pytest.mark.parametrize("exponent", range(1, 38))
 @pytest.mark.parametrize("offset", [-1, 0, 1])
-def test_a_duration_lies_in_a_bucket_at_most_an_eighth_wider_than_itself(exponent: int, offset: int) -> None:
+def test_a_bucket_is_no_more_than_an_eighth_wider_than_its_duration(exponent: int, offset: int) -> None:
     microseconds = 2**exponent + offset
     ((upper, count),) = histogram((microseconds + 0.5) / 1e6).buckets()
     assert count == 1
@@ -40,9 +40,9 @@ def test_percentiles_are_true_to_within_an_eighth() -> None:
         assert made.percentile(share) <= true * (1 + 1 / SUB_BUCKETS) + 1e-6
 
 
-def test_the_greatest_is_exact_and_no_percentile_is_above_it() -> None:
+def test_the_maximum_is_exact_and_no_percentile_is_above_it() -> None:
     made = histogram(0.001, 0.00103)
-    assert made.greatest == made.percentile(1.0) == 0.00103
+    assert made.max == made.percentile(1.0) == 0.00103
     assert made.total == pytest.approx(0.00203)
 
 
@@ -58,14 +58,14 @@ def test_it_is_bounded_whatever_it_is_fed() -> None:
     made = histogram(-1.0, 0.0, 1e12)
     assert made.count == 3
     assert made.percentile(0.5) == pytest.approx(1e-6)
-    assert made.greatest == 1e12
-    assert made.percentile(1.0) < 1e12, "beyond the last bucket only `greatest` is exact"
+    assert made.max == 1e12
+    assert made.percentile(1.0) < 1e12, "beyond the last bucket only `max` is exact"
 
 
 def test_a_snapshot_is_made_of_plain_numbers() -> None:
     stats = BusStats(10.0)
-    stats.counts["turns"] += 2
-    stats.counts["echoes"] += 0
+    stats.counts[Counter.TURNS] += 2
+    stats.counts[Counter.ECHOES] += 0
     stats.turns.add(0.002)
     stats.busy = 0.25
     assert stats.snapshot(11.0) == {

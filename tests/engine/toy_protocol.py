@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from servobus.engine.coalescer import Coalescer, Ticket
-from servobus.engine.health import Condition, Health, Node
+from servobus.engine.health import Node, NodeTable
 from servobus.engine.scheduler import QUEUE_LIMIT, Scheduler
 from servobus.errors import DeviceError
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request
-from servobus.values import Goal, Outcome, ServoGoal
+from servobus.values import Goal, Health, Outcome, ServoGoal
 
 READ, PING, WRITE, ANSWER = 1, 2, 3, 0x80
 ALL = 0xFF
@@ -55,30 +55,30 @@ def reply(node: int, *payload: int) -> ToyReply:
 
 class ToyCodec:
     def __init__(self) -> None:
-        self._heard = b""
+        self._buffer = b""
         self.skipped = 0
 
     @property
     def pending(self) -> int:
-        return len(self._heard)
+        return len(self._buffer)
 
     def receive_data(self, data: bytes) -> None:
-        self._heard += data
+        self._buffer += data
 
     def next_reply(self) -> ToyReply | None:
-        while len(self._heard) >= 5:
-            size = self._heard[2] + 4
-            if self._heard[0] == 0xA5 and len(self._heard) < size:
+        while len(self._buffer) >= 5:
+            size = self._buffer[2] + 4
+            if self._buffer[0] == 0xA5 and len(self._buffer) < size:
                 return None
-            frame = self._heard[:size]
+            frame = self._buffer[:size]
             if frame[0] == 0xA5 and sum(frame[1:-1]) & 0xFF == frame[-1]:
-                self._heard = self._heard[size:]
+                self._buffer = self._buffer[size:]
                 return ToyReply(frame)
-            self._heard, self.skipped = self._heard[1:], self.skipped + 1
+            self._buffer, self.skipped = self._buffer[1:], self.skipped + 1
         return None
 
     def reset(self) -> None:
-        self._heard = b""
+        self._buffer = b""
 
     def describe(self, frame: bytes, *, sent: bool) -> str:
         return f"{'>' if sent else '<'} {frame.hex(' ')}"
@@ -126,10 +126,10 @@ def shout(value: int = 0) -> ToyRequest:
 
 
 class ToyDriver:
-    """Servos `s1`, `s2`, ... at nodes 1, 2, ...; a goal turn is one broadcast for at most `most` servos."""
+    """Servos `s1`, `s2`, ... at nodes 1, 2, ...; a goal plan is one broadcast for up to `goals_per_frame` servos."""
 
-    def __init__(self, most: int = 8) -> None:
-        self.most = most
+    def __init__(self, goals_per_frame: int = 8) -> None:
+        self.goals_per_frame = goals_per_frame
         self.restarted: set[int] = set()
         self.refusal: Exception | None = None
         """What `plan` raises."""
@@ -143,8 +143,8 @@ class ToyDriver:
         if self.refusal is not None:
             raise self.refusal
         names = [goal.servo for goal in goals]
-        most = len(names) if together else self.most
-        parts = [tuple(names[at : at + most]) for at in range(0, len(names), most)]
+        size = len(names) if together else self.goals_per_frame
+        parts = [tuple(names[at : at + size]) for at in range(0, len(names), size)]
         return [GoalPlan(part, self._say(part)) for part in parts]
 
     @staticmethod
@@ -154,7 +154,7 @@ class ToyDriver:
 
 
 def ticket(number: int, ended: list[tuple[str, Any]], *, expires: float = 1.0, **traits: Any) -> Ticket:
-    """A goal of servo `s<number>`; how it ends is told to `ended`."""
+    """A goal of servo `s<number>`; how it ends is put into `ended`."""
     servo = f"s{number}"
     return Ticket(
         ServoGoal(servo, Goal("position", 0.0)), number, expires, lambda result: ended.append((servo, result)), **traits
@@ -162,7 +162,7 @@ def ticket(number: int, ended: list[tuple[str, Any]], *, expires: float = 1.0, *
 
 
 class Sink:
-    """What a caller holds: all it was told, in order."""
+    """The caller's end of a job: its results, in order."""
 
     def __init__(self) -> None:
         self.results: list[Any] = []
@@ -179,27 +179,29 @@ class Sink:
 
 
 class Bench:
-    """A scheduler with its health, without a line. All nodes have been heard."""
+    """A scheduler with its nodes, without a line. All nodes are online."""
 
-    def __init__(self, *nodes: int, online: bool = True, limit: int = QUEUE_LIMIT, most: int = 8) -> None:
-        self.driver = ToyDriver(most)
-        self.changes: list[tuple[int, Condition, Condition]] = []
+    def __init__(self, *nodes: int, online: bool = True, limit: int = QUEUE_LIMIT, goals_per_frame: int = 8) -> None:
+        self.driver = ToyDriver(goals_per_frame)
+        self.changes: list[tuple[int, Health, Health]] = []
         self.updates: list[Any] = []
         self.restarts: list[int] = []
         self.cuts: list[tuple[str, Exception]] = []
-        self.health = Health(nodes or (1, 2, 3), changed=self._changed)
+        self.nodes = NodeTable(nodes or (1, 2, 3), changed=self._changed)
         self.scheduler = Scheduler(
             cast("Driver", self.driver),
-            self.health,
+            self.nodes,
+            enabled_servos=lambda node: (),
             on_update=self.updates.append,
             on_restart=lambda node: self.restarts.append(node.id),
             on_cut=lambda servo, error: self.cuts.append((servo, error)),
-            cycle=10.0,
+            on_setpoint=lambda servo, setpoint: None,
+            goal_rate_hz=10.0,
             limit=limit,
         )
         if online:
-            for node in list(self.health.nodes.values()):
-                self.health.recovered(node)
+            for node in list(self.nodes.by_id.values()):
+                self.nodes.fenced(node)
             self.changes.clear()
 
     @property
@@ -207,14 +209,14 @@ class Bench:
         return self.scheduler.coalescer
 
     def node(self, number: int) -> Node:
-        return self.health.node(number)
+        return self.nodes.node(number)
 
     def take_offline(self, number: int, now: float = 0.0) -> None:
-        while self.node(number).condition is not Condition.OFFLINE:
-            self.health.missed(self.node(number), READ | ANSWER, now, now)
+        while self.node(number).health is not Health.OFFLINE:
+            self.nodes.missed(self.node(number), READ | ANSWER, now, now)
 
-    def _changed(self, node: Node, before: Condition) -> None:
-        self.changes.append((node.id, before, node.condition))
+    def _changed(self, node: Node, before: Health) -> None:
+        self.changes.append((node.id, before, node.health))
         self.scheduler.node_changed(node)
 
 

@@ -144,7 +144,7 @@ async def test_what_was_under_way_fails_when_the_arm_is_gone_and_goes_on_when_it
     async with behind() as (rig, hand, server):
         hand.extra_delay = 0.5
         reading = asyncio.create_task(rig.read_register("index", "stall_speed"))
-        await until(lambda: bool(rig.buses["hand"].master._flight))
+        await until(lambda: bool(rig.buses["hand"].engine.in_flight))
         server.hang_up()
         with pytest.raises(LinkDown, match=r"closed the connection|was lost"):
             await reading

@@ -153,7 +153,7 @@ async def test_settle_says_where_it_stands(over: Over, tmp_path: Path) -> None:
         await rig.enable()
         devices(home)[1].joint.stuck = True
         await rig["s1"].move_to(30)
-        with pytest.raises(SettleTimeout, match=r"did not settle within 20 s: it stands at 0\.0"):
+        with pytest.raises(SettleTimeout, match=r"did not settle within 20 s: it is at 0\.0"):
             await rig["s1"].settle(timeout=20)
         devices(home)[1].joint.stuck = False
         assert (await rig["s1"].settle(timeout=math.inf, tolerance=2)).position == pytest.approx(30, abs=2)

@@ -137,7 +137,7 @@ async def test_who_waits_for_arrival_is_told_that_it_will_not_come() -> None:
         settling = asyncio.create_task(rig["s1"].settle())
         await asyncio.sleep(0.05)
         await rig.stop()
-        with pytest.raises(EStopped, match="before it stood at its goal"):
+        with pytest.raises(EStopped, match="before the servo arrived at its goal"):
             await settling
 
 

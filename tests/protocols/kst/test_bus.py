@@ -124,14 +124,14 @@ async def test_a_servo_that_restarts_is_disabled() -> None:
 @virtual
 async def test_an_id_is_changed_in_a_session() -> None:
     async with running() as (bus, servos, _), bus.exclusive() as session:
-        change = await bus.perform(commissioning(bus).set_id(1, 9, save=True), 1, urgent=True, session=session)
+        change = await bus.perform(commissioning(bus).set_id(1, 9, save=True), 1, even_if_offline=True, session=session)
         assert change.saved
         servos[0].reboot(bus.clock())
         await asyncio.sleep(1)
         assert servos[0].node == 9
         plan = commissioning(bus).restarted(1)
         assert plan is not None
-        assert await bus.perform(plan, 9, urgent=True, session=session) == 9
+        assert await bus.perform(plan, 9, even_if_offline=True, session=session) == 9
 
 
 def commissioning(bus: BusService) -> KstCommissioning:

@@ -12,6 +12,7 @@ import pytest
 
 from servobus.bus.bandwidth import line_bandwidth
 from servobus.bus.service import BusService
+from servobus.engine.stats import Counter
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
@@ -78,12 +79,12 @@ async def test_a_hand_is_met_enabled_moved_and_stopped() -> None:
     async with running(HAND) as (bus, hands, events):
         for name in HAND:
             await bus.motion.enable(name)
-        before = bus.stats.counts["frames"]
+        before = bus.stats.counts[Counter.FRAMES]
         results = await move(bus, **dict.fromkeys(HAND, 40.0))
         assert set(results.values()) == {Outcome.ACKED}
         assert hands[0].written == [(1135 + number, 26214) for number in range(6)]
         assert bus.scheduler.goal_turns == 1
-        assert bus.stats.counts["frames"] - before < 6
+        assert bus.stats.counts[Counter.FRAMES] - before < 6
         for name in HAND:
             await bus.motion.settle(name, tolerance=None, timeout=5)
         await asyncio.sleep(0.5)
