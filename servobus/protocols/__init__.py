@@ -1,1 +1,1 @@
-"""FLOOR 1: the languages of the wire, sans-IO."""
+"""The protocols of the wire. Nothing here does I/O or knows the time."""

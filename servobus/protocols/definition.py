@@ -1,4 +1,4 @@
-"""What a protocol folder offers to the floors above: the shape of a line of `table.py`."""
+"""What a protocol package offers to the packages above: one `ProtocolDefinition`, listed in `registry.py`."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from servobus.protocols.options import BusOptions
 
 
 def one_servo(node: int, model: str) -> dict[str, dict[str, Any]]:
-    """A node that is one servo."""
+    """Return the YAML of a node that is one servo."""
     return {f"servo_{node}": {"id": node, "model": model}}
 
 
 @dataclass(frozen=True, slots=True)
 class ProtocolDefinition:
-    """The parts of one protocol. `options` below is always an instance of its own options class."""
+    """The parts of one protocol. The options passed to them are an instance of its options class."""
 
     options: type[BusOptions]
-    """Its YAML keys."""
+    """The class of its YAML keys."""
     models: Callable[[Any, Path], Mapping[str, ServoModel]]
-    """(options, the config's folder) -> every model its servos name, by that name. Raises ConfigError."""
+    """(options, folder of the config) -> every model that the servos name, by that name. Raises ConfigError."""
     codec: Callable[[Any], Codec]
-    """For the master's end of the line, with the options of its bus; None: as the documents have it."""
+    """(options or None) -> the codec of the master's end of the line; None: as the documents describe it."""
     driver: Callable[[Any, Mapping[str, Any]], Driver]
+    """(options, models) -> the driver of a bus."""
     device_codec: Callable[[Any], Codec]
-    """For the devices' end of the line, likewise."""
+    """The codec of the devices' end of the line, likewise."""
     devices: Callable[[Any, Mapping[str, Any]], Sequence[Device]]
-    """The simulated halves of the bus's servos."""
+    """(options, models) -> the simulated nodes of a bus."""
     rename: Callable[[bytes, Random], bytes]
-    """A reply frame in the name of another node, checksum right: for the fault injector."""
+    """(reply frame, random) -> the frame with the id of another node and a right checksum, for the fault injector."""
     node_of: Callable[[bytes], int]
-    """The node that a reply frame names."""
+    """(reply frame) -> the id in it."""
     baudrates: tuple[int, ...]
-    """Rates a scan tries, the likely ones first."""
+    """Baud rates that a scan tries, the likely ones first."""
     scan_ids: range
     starter: Callable[[int, str], Mapping[str, Mapping[str, Any]]] = one_servo
-    """(id, model) of what a scan found -> its servos, by name, as the YAML of a config."""
+    """(id, model) of a node that a scan found -> its servos by name, as the YAML of a config."""

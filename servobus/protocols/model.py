@@ -1,7 +1,7 @@
-"""What a kind of servo is, as data: the register map shared by driver and simulated device.
+"""A kind of servo as data: the register map that the driver and the simulated device share.
 
-A model is a YAML file. Everything that differs between models stands there, never in code: addresses, byte order, signs, scales,
-defaults, capabilities. `Register` turns raw integers into physical values and back, and refuses what the register cannot hold.
+A model is a YAML file with everything that differs between models: addresses, byte order, signs, scales, defaults, capabilities.
+`Register` converts between raw integers and physical values, and refuses what the register cannot hold.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Pair = Annotated[tuple[T, T], BeforeValidator(lambda value: tuple(value) if isin
 
 
 class Data(BaseModel):
-    """Frozen, strict, and deaf to unknown keys: how every model and config file is read. What stands under a key explains it in
+    """The base of everything that is read from YAML: frozen, strict, unknown keys refused. The text under a key explains it, in
     editors too, through the schema."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
@@ -39,16 +39,16 @@ class Register(Data):
     sign_bit: Annotated[int, Field(ge=1, le=31)] | None = None
     """Sign-magnitude with the sign in this bit; None: unsigned."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """Physical units per count."""
+    """Physical units per raw step."""
     unit: str = ""
-    """Of the physical value. `position` and `speed` are turned into the servo's own unit by its calibration."""
+    """Unit of the physical value. The servo's calibration turns `position`, `speed` and `acceleration` into its own unit."""
     minimum: int | None = None
     maximum: int | None = None
-    """Raw limits of what may be written; None: what the bytes can hold."""
+    """Raw limits of a write; None: those of the bytes."""
     default: int | None = None
     """Raw power-on (ram) or factory (eeprom) value, where the documents name one."""
     values: dict[int, int | float | str] = {}
-    """Codes that stand for other values: raw -> physical."""
+    """Codes: raw -> physical value."""
     aliases: list[str] = []
 
     @property
@@ -58,51 +58,52 @@ class Register(Data):
 
     @property
     def capacity(self) -> tuple[int, int]:
-        """Least and greatest raw value that the bytes can hold."""
-        greatest = (1 << self.sign_bit) - 1 if self.sign_bit is not None else (1 << 8 * self.size) - 1
-        return (-greatest if self.sign_bit is not None else 0, greatest)
+        """Lowest and highest raw value that the bytes can hold."""
+        high = (1 << self.sign_bit) - 1 if self.sign_bit is not None else (1 << 8 * self.size) - 1
+        return (-high if self.sign_bit is not None else 0, high)
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        """Least and greatest raw value that can be written."""
-        least, greatest = self.capacity
-        return (least if self.minimum is None else self.minimum, greatest if self.maximum is None else self.maximum)
+        """Lowest and highest raw value that can be written."""
+        low, high = self.capacity
+        return (low if self.minimum is None else self.minimum, high if self.maximum is None else self.maximum)
 
     def decode(self, data: bytes, byte_order: Literal["little", "big"]) -> int:
-        """The raw signed integer in these bytes."""
+        """Return the raw signed integer in these bytes."""
         word = int.from_bytes(data, byte_order)
         if self.sign_bit is not None and word >> self.sign_bit & 1:
             return -(word & ((1 << self.sign_bit) - 1))
         return word
 
     def encode(self, raw: int, byte_order: Literal["little", "big"]) -> bytes:
-        """The bytes of a raw integer. Raises LimitError outside `raw_range`."""
-        least, greatest = self.raw_range
-        if not least <= raw <= greatest:
-            raise LimitError(f"register {self.name}: raw value {raw} is outside {least} to {greatest}")
+        """Return the bytes of a raw integer. Raises LimitError outside `raw_range`."""
+        low, high = self.raw_range
+        if not low <= raw <= high:
+            raise LimitError(f"register {self.name}: raw value {raw} is outside {low} to {high}")
         word = (1 << self.sign_bit) - raw if self.sign_bit is not None and raw < 0 else raw
         return word.to_bytes(self.size, byte_order)
 
     def to_physical(self, raw: int) -> int | float | str:
+        """Return the physical value of a raw integer, in the register's unit."""
         if self.values:
             return self.values.get(raw, raw)
         return raw if self.scale == 1.0 else round(raw * self.scale, 9)
 
     def to_raw(self, value: Any) -> int:
-        """The raw integer of a physical value. Raises LimitError for what is no value of this register."""
+        """Return the raw integer of a physical value. Raises LimitError for a value that this register cannot have."""
         if self.values:
             for raw, physical in self.values.items():
                 if physical == value:
                     return raw
-            known = ", ".join(str(physical) for physical in self.values.values())
-            raise LimitError(f"register {self.name}: {value!r} is none of {known}")
+            values = ", ".join(str(physical) for physical in self.values.values())
+            raise LimitError(f"register {self.name}: {value!r} is not one of {values}")
         if not is_number(value):
             raise LimitError(f"register {self.name}: {value!r} is not a finite number")
         return round(float(value) / self.scale)
 
 
 class ServoModel(Data):
-    """What is common to the models of every protocol."""
+    """The parts that the models of every protocol have."""
 
     name: str
     title: str
@@ -113,14 +114,14 @@ class ServoModel(Data):
     zero: int = 0
     """The raw value at position 0."""
     default_speed: Annotated[float, Field(gt=0)] | None = None
-    """Raw steps/s a goal travels at when nobody says more."""
+    """Raw steps/s of a goal, when neither the goal nor the config names a speed."""
     status_bits: dict[Annotated[int, Field(ge=0, le=31)], str] = {}
     model_numbers: dict[int, str] = {}
 
     @property
     def goal_ranges(self) -> dict[str, tuple[float, float]]:
-        """What goals can carry, least and greatest: position (raw steps), speed (steps/s), acceleration (steps/s^2), torque_limit
-        (%). Nothing: the model does not take it. Absent: not known here."""
+        """Lowest and highest value of each part of a goal: position (raw steps), speed (steps/s), acceleration (steps/s^2),
+        torque_limit (%). (0, 0): the model does not take it. Absent: the range is not known."""
         return {}
 
     @model_validator(mode="before")
@@ -136,12 +137,12 @@ class ServoModel(Data):
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:
-        seen: dict[str, str] = {}
+        owners: dict[str, str] = {}
         for register in self.registers.values():
             for name in (register.name, *register.aliases):
-                if name in seen:
-                    raise ValueError(f"the name {name} stands for both {seen[name]} and {register.name}")
-                seen[name] = register.name
+                if name in owners:
+                    raise ValueError(f"the name {name} means both {owners[name]} and {register.name}")
+                owners[name] = register.name
         return self
 
     @cached_property
@@ -150,27 +151,29 @@ class ServoModel(Data):
         return {name: register for register in self.registers.values() for name in (register.name, *register.aliases)}
 
     def register(self, name: str) -> Register:
-        """Raises UnknownName and says what there is."""
+        """Return the register of a name or an alias. Raises UnknownName, which lists the names."""
         try:
             return self.by_name[name]
         except KeyError:
-            known = ", ".join(sorted(self.registers))
-            raise UnknownName(f"model {self.name} has no register {name!r}; it has {known}") from None
+            names = ", ".join(sorted(self.registers))
+            raise UnknownName(f"model {self.name} has no register {name!r}; it has {names}") from None
 
     def readable(self, name: str) -> Register:
+        """Return a register that can be read. Raises UnknownName, NotSupported."""
         register = self.register(name)
         if register.access == "w":
             raise NotSupported(f"register {register.name} of model {self.name} can only be written")
         return register
 
     def writable(self, name: str) -> Register:
+        """Return a register that can be written. Raises UnknownName, NotSupported."""
         register = self.register(name)
         if register.access == "r":
             raise NotSupported(f"register {register.name} of model {self.name} can only be read")
         return register
 
     def fault_names(self, status: int | None) -> tuple[str, ...]:
-        """Names of the bits set in a status byte; a bit without a name is `bit N`."""
+        """Return the names of the bits that are set in a status byte; a bit without a name is `bit N`."""
         if not status:
             return ()
         return tuple(self.status_bits.get(bit, f"bit {bit}") for bit in range(32) if status >> bit & 1)

@@ -1,4 +1,4 @@
-"""What a YAML config may say of any bus and any servo. Each protocol adds its own keys in its own folder.
+"""The YAML keys of every bus and of every servo. Each protocol adds its own keys in its own package.
 
 Times in seconds unless the key says `_ms`; positions in the servo's unit, speeds in unit/s.
 """
@@ -31,28 +31,28 @@ Rate = Annotated[float, Field(gt=0, le=1000)]
 
 
 class FaultOptions(Data):
-    """What `links/faulty.py` does to a simulated line. Shares are per frame, 0 to 1."""
+    """The faults of a simulated line (`links/faulty.py`). Shares are per frame, 0 to 1."""
 
     loss: Share = 0.0
-    """Replies that never come."""
+    """Share of replies that are lost."""
     chop: Literal["whole", "bytes", "random"] = "whole"
-    """How replies are delivered: in one piece, byte by byte, in random pieces."""
+    """How replies are delivered: in one piece, byte by byte, or in random pieces."""
     late: Share = 0.0
-    """Replies that come `delay_ms` too late."""
+    """Share of replies that come `delay_ms` too late."""
     delay_ms: Annotated[float, Field(ge=0, le=10_000)] = 0.0
     duplicate: Share = 0.0
-    """Replies said twice, back to back."""
+    """Share of replies that are sent twice, back to back."""
     truncate: Share = 0.0
     drop_byte: Share = 0.0
     insert_byte: Share = 0.0
     flip: Share = 0.0
-    """Replies with one byte changed."""
+    """Share of replies with one byte changed."""
     wrong_id: Share = 0.0
-    """Replies in the name of another node, checksum right."""
+    """Share of replies with the id of another node and a right checksum."""
     noise: Share = 0.0
-    """Zero bytes before a reply."""
+    """Share of replies with zero bytes before them."""
     echo: Share = 0.0
-    """Requests heard back."""
+    """Share of requests that come back as an echo."""
     seed: int = 0
 
 
@@ -64,42 +64,42 @@ class ServoOptions(Data):
     zero: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
     """Raw steps where the joint is at 0; the model's own if omitted."""
     direction: Literal[1, -1] = 1
-    """-1: mounted the other way round."""
+    """-1: the servo is mounted the other way round."""
     gear: Annotated[float, Field(ge=0.001, le=1000)] = 1.0
     """Turns of the servo for one turn of the joint."""
     limits: Pair[Finite] | None = None
-    """Least and greatest position a goal may have."""
+    """Lowest and highest position that a goal may have."""
     on_limit: Literal["reject", "clamp"] = "reject"
-    """What happens to a goal outside a limit: it is refused, or the nearest inside is sent and said so."""
+    """What happens to a goal outside a limit: it is refused, or the nearest value inside is sent and an event reports that."""
     speed: Positive | None = None
-    """Unit/s of goals that name none; max_speed if omitted."""
+    """Unit/s of goals that name no speed; max_speed if omitted."""
     max_speed: Positive | None = None
-    """Unit/s."""
+    """Unit/s that no goal may exceed."""
     max_step: Positive | None = None
-    """Greatest distance from the last setpoint that one goal may ask for."""
+    """Longest distance from the last setpoint that one goal may ask for."""
     acceleration: Positive | None = None
-    """Unit/s^2."""
+    """Unit/s^2 of goals that name no acceleration."""
     torque_limit: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Percent."""
+    """Percent of the servo's torque, for goals that name no effort."""
     ttl: Positive | None = None
     """Seconds that a goal may wait for its first byte to leave; later it is dropped."""
     on_estop: StopKind = "hold"
-    """What an e-stop does: hold stays where it is, limp switches torque off, park goes to park_pose and then limp."""
+    """What an e-stop does: hold keeps the present position, limp switches torque off, park goes to park_pose and then limp."""
     on_exit: StopKind = "hold"
     """The same, when servobus ends."""
     on_lost_client: StopKind = "hold"
-    """The same, when the program that moves the servo is gone."""
+    """The same, when the program that moved the servo is gone."""
     park_pose: Finite | None = None
     park_timeout: Positive = 5.0
-    """Seconds on the way to park_pose; then limp, wherever it is."""
+    """Seconds to reach park_pose; then the servo goes limp, wherever it is."""
     unit: str | None = None
-    """Of positions and speeds: one of the model's units, the first of them if omitted."""
+    """Unit of positions and speeds: one of the model's units, the first of them if omitted."""
     allow_max_speed: bool = False
-    """Let a goal's speed be 0, which servos take as no limit."""
+    """Permit speed 0 in a goal, which means no limit to servos."""
 
     @property
     def key(self) -> Hashable:
-        """What no two servos of a bus share."""
+        """What no two servos of a bus may have in common."""
         return self.id
 
     @model_validator(mode="after")
@@ -116,7 +116,7 @@ class ServoOptions(Data):
         return self
 
     def calibration(self, model: ServoModel) -> Calibration:
-        """Steps to the servo's unit. The unit must be one of the model's."""
+        """Return the conversion from raw steps to the servo's unit, which must be one of the model's."""
         unit = self.unit or next(iter(model.units))
         zero = float(model.zero) if self.zero is None else self.zero
         return Calibration(zero, self.direction, model.units[unit] / self.gear)
@@ -126,9 +126,9 @@ class PollRates(Data):
     """Reads on a fixed grid, in Hz; omit for none."""
 
     feedback: Rate | None = None
-    """What control needs: position, speed, load and what stands beside them."""
+    """Rate of the values that control needs: position, speed, load and the registers beside them."""
     health: Rate | None = None
-    """Everything that is known of a servo."""
+    """Rate of the whole state."""
 
     def rates(self) -> dict[str, float]:
         return {name: hz for name, hz in (("feedback", self.feedback), ("health", self.health)) if hz}
@@ -139,20 +139,21 @@ class BusOptions(Data):
 
     protocol: str
     port: Annotated[str, Field(min_length=1, max_length=255)]
-    """Device path, tcp://HOST:PORT, or sim: for simulated servos. Best a /dev/serial/by-id name, which belongs to the adapter."""
+    """Device path, tcp://HOST:PORT, or sim: for simulated servos. A /dev/serial/by-id name is best, because it belongs to the
+    adapter."""
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)]
     """Bits/s that the servos are set to."""
     poll: PollRates = PollRates()
     goal_rate: Rate | None = None
-    """Hz that `check` counts goals with; the feedback rate if omitted."""
+    """Hz at which goals are expected; `check` computes the line's load with it. The feedback rate if omitted."""
     echo: Literal["off", "on", "auto"] = "off"
-    """Whether the adapter hears what it says; auto finds out by asking an id that nobody has."""
+    """Whether the adapter receives what it sends; auto finds out with a request to an id that nobody has."""
     rs485: bool = False
-    """Let the driver of the port switch the transmitter; USB adapters do it by themselves."""
+    """Let the driver of the port switch the transmitter; USB adapters switch it by themselves."""
     timeout_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
-    """Greatest deadline of a turn beyond its wire time; 100 ms if omitted."""
+    """Longest wait for a reply beyond its wire time; 100 ms if omitted."""
     faults: FaultOptions | None = None
-    """For simulated lines: how bad the line is."""
+    """Faults of a simulated line."""
     servos: Mapping[Name, ServoOptions] = {}
 
     @model_validator(mode="after")
@@ -163,7 +164,7 @@ class BusOptions(Data):
 
     @property
     def spread(self) -> float | None:
-        """On four wires: seconds by which the pauses before two servos' answers may differ. None: half duplex."""
+        """On four wires: seconds by which the pauses before the replies of two servos may differ. None: half duplex."""
         return None
 
     @property

@@ -1,4 +1,4 @@
-"""The protocols there are: one line each. Nothing outside this table and its own folder names a protocol."""
+"""The protocols, one line each. Only this table and a protocol's own package name the protocol."""
 
 from __future__ import annotations
 

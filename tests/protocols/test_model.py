@@ -74,7 +74,7 @@ def test_what_is_no_number_is_refused(value: object) -> None:
 
 
 def test_a_value_without_a_code_is_refused() -> None:
-    with pytest.raises(LimitError, match="9600 is none of 1000000, 115200, factory"):
+    with pytest.raises(LimitError, match="9600 is not one of 1000000, 115200, factory"):
         CODES.to_raw(9600)
 
 
@@ -113,7 +113,7 @@ def test_names_of_faults(status: int | None, names: tuple[str, ...]) -> None:
 
 def test_one_name_stands_for_one_register() -> None:
     registers = {**MODEL["registers"], "load": {"address": 1, "aliases": ["position"]}}  # type: ignore[dict-item]
-    with pytest.raises(ValidationError, match="the name position stands for both position and load"):
+    with pytest.raises(ValidationError, match="the name position means both position and load"):
         ServoModel.model_validate({**MODEL, "registers": registers})
     with pytest.raises(ValidationError, match="registers"):
         ServoModel.model_validate({**MODEL, "registers": {"a": 7}})

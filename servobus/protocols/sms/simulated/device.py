@@ -1,9 +1,9 @@
-"""A simulated FEETECH servo: seed 1.1 to 1.4 from the other end of the line, on the same model file as the driver.
+"""A simulated FEETECH servo: the other end of SMS 1.0 (1.1 to 1.4), on the same model file as the driver.
 
-What it does with an instruction is the table `VERBS`; whether that is answered follows the tables of the codec. What the
-documents leave open: a packet that is malformed, unknown, or (SYNC READ) not of this model gets no answer; READ past address 255
-gets what exists; an id or a baud rate takes effect at once, so that the answer to an id write carries the new id (feetech.md,
-section 9), and the line sends the answer to a baud write still at the old rate.
+The table `VERBS` maps each instruction to what the servo does; the tables of the codec decide whether it answers. Where the
+documents are silent: a packet that is malformed, unknown, or (SYNC READ) not supported by this model gets no reply; READ beyond
+address 255 gets the bytes that exist; an id or a baud rate takes effect at once, so the reply to an id write has the new id, and
+the line still sends the reply to a baud rate write at the old rate.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.simulated.servo import SimulatedServo
 
 SHORTEST_DELAY = 50
-"""A return delay below this, but not 0, acts as this (units of 2 us; feetech.md, section 2)."""
+"""A return delay below this, but not 0, acts as this (units of 2 us; FEETECH memory table, address 7)."""
 
 REBOOT = 0x08
-"""Newer than the seed, and never answered (feetech.md, section 4)."""
+"""An instruction newer than SMS 1.0, which is never answered."""
 
 Answer: TypeAlias = tuple[int, bytes] | None
-"""Place among the answers, and parameters; None: silence."""
+"""Slot among the replies, and parameters; None: no reply."""
 
 
 class SmsDevice(SimulatedServo):
@@ -36,14 +36,14 @@ class SmsDevice(SimulatedServo):
     ) -> None:
         super().__init__(model, servo_id, baudrate=baudrate, position=position, response_level=response_level)
         self.dead = False
-        """Hears and says nothing."""
+        """It neither receives nor sends."""
         self.extra_delay = 0.0
-        """Seconds that its answers come too late."""
+        """Seconds by which its replies are late."""
         self._armed: tuple[int, bytes] | None = None
         self._awake = -math.inf
 
     def handle(self, packet: Packet, now: float) -> Sequence[DeviceReply]:
-        """Obey a packet, and answer it where the rules of the protocol say so."""
+        """Carry out a packet, and answer it where the protocol demands a reply."""
         everybody = packet.id == BROADCAST_ID
         if not (everybody or packet.id == self.node) or self.dead or now < self._awake:
             return ()
@@ -57,7 +57,7 @@ class SmsDevice(SimulatedServo):
         return (DeviceReply(encode(self.node, self.faults, params), self._delay(), slot, self.extra_delay),)
 
     def reboot(self, now: float) -> None:
-        """Restart, and be silent meanwhile."""
+        """Restart; it does not answer meanwhile."""
         self._awake = now + self.model.reboot_s
         self._armed = None
         self.restart(now)
@@ -65,14 +65,14 @@ class SmsDevice(SimulatedServo):
     # Instructions
 
     def ping(self, packet: Packet, now: float) -> Answer:
-        """Asked all at once, newer servos answer one after another by id: clients count on it. Older ones all speak at once."""
+        """To the broadcast id, newer servos answer one after another by id, and clients rely on it. Older ones collide."""
         in_turn = self.model.sync_read and packet.id == BROADCAST_ID
         return self.node if in_turn else 0, b""
 
     def read(self, packet: Packet, now: float) -> Answer:
         if len(packet.params) != 2:
             return None
-        return 0, self.look(packet.params[0], packet.params[1], now)
+        return 0, self.read_table(packet.params[0], packet.params[1], now)
 
     def write(self, packet: Packet, now: float) -> Answer:
         if len(packet.params) < 2:
@@ -102,7 +102,7 @@ class SmsDevice(SimulatedServo):
         return None
 
     def sync_write(self, packet: Packet, now: float) -> Answer:
-        """Its own part of the packet, which has a whole number of parts."""
+        """Carry out this servo's part of the packet, which must have a whole number of parts."""
         params = packet.params
         if len(params) >= 2 and packet.id == BROADCAST_ID and (len(params) - 2) % (params[1] + 1) == 0:
             step = params[1] + 1
@@ -112,13 +112,13 @@ class SmsDevice(SimulatedServo):
         return None
 
     def sync_read(self, packet: Packet, now: float) -> Answer:
-        place = packet.params.find(self.node, 2)
-        if not self.model.sync_read or packet.id != BROADCAST_ID or place < 0:
+        slot = packet.params.find(self.node, 2)
+        if not self.model.sync_read or packet.id != BROADCAST_ID or slot < 0:
             return None
-        return place - 2, self.look(packet.params[0], packet.params[1], now)
+        return slot - 2, self.read_table(packet.params[0], packet.params[1], now)
 
     def _arm(self, armed: tuple[int, bytes] | None) -> None:
-        """Keep what ACTION shall apply; the flag register tells."""
+        """Keep the write that ACTION will carry out, and set the flag register."""
         self._armed = armed
         self.memory.put(self.memory.registers["async_write_flag"], int(armed is not None))
 
@@ -141,7 +141,7 @@ VERBS: dict[int, Callable[[SmsDevice, Packet, float], Answer]] = {
 
 
 def devices(options: SmsBus, models: Mapping[str, SmsModel]) -> list[SmsDevice]:
-    """The servos of a bus, each standing at its zero, which is its middle unless the config says otherwise."""
+    """Return the servos of a bus, each at its zero, which is its middle unless the config has another."""
     level = 1 if options.status_return == "all" else 0
     return [
         SmsDevice(

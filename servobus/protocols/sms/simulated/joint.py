@@ -1,6 +1,6 @@
-"""A simulated joint: where it is at a time one names. Nothing runs between two questions; `advance` catches up.
+"""A simulated joint: its position at any given time. Nothing runs between two calls; `advance` computes what happened since.
 
-It speeds up and stops at once (acceleration is not simulated), knows no gravity, and warms up with its load.
+It reaches its speed and stops at once (acceleration is not simulated), has no gravity, and warms up with its load.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 AMBIENT = 25.0
 RISE = 40.0
-"""Degrees above ambient that full load ends at."""
+"""Degrees above ambient that full load leads to."""
 THERMAL_S = 100.0
-"""Seconds after which 63 % of the way to that are done."""
+"""Seconds after which 63 % of that rise are reached."""
 
 
 @dataclass(slots=True)
@@ -25,33 +25,33 @@ class Joint:
     position: float
     target: float
     rate: float = 0.0
-    """On the way to the target; signed where it turns as a wheel."""
+    """Speed towards the target; signed in wheel mode."""
     driven: bool = False
     wheel: bool = False
     wraps: bool = True
-    """After one turn it reports 0 again; False: it counts turns."""
+    """It reports 0 again after one turn; False: it counts turns."""
     stuck: bool = False
-    """For tests: something holds it where it is."""
+    """For tests: something blocks it."""
     temperature: float = AMBIENT
     at: float = -math.inf
 
     def advance(self, now: float) -> None:
-        """Be where it is at `now`; a time that has passed already changes nothing."""
+        """Move to where it is at `now`; an earlier time changes nothing."""
         elapsed = now - self.at
         if elapsed <= 0:
             return
         self.at = now
         if elapsed == math.inf:
-            return  # the first time it is told the time
+            return  # this is the first time that is known
         load = self.load
-        way = self.velocity * elapsed
+        distance = self.velocity * elapsed
         busy = elapsed if load else 0.0
         if self.wheel:
-            self.position += way
-        elif way:
+            self.position += distance
+        elif distance:
             left = self.target - self.position
-            busy = elapsed * min(1.0, left / way)
-            self.position = self.target if abs(left) <= abs(way) else self.position + way
+            busy = elapsed * min(1.0, left / distance)
+            self.position = self.target if abs(left) <= abs(distance) else self.position + distance
         if self.wraps:
             self.position %= self.turn
         self._warm(busy, abs(load))
@@ -59,16 +59,16 @@ class Joint:
 
     @property
     def velocity(self) -> float:
-        return 0.0 if self.stuck else self._wanted
+        return 0.0 if self.stuck else self._free_velocity
 
     @property
     def load(self) -> float:
-        """-1 to 1: with its speed while it moves, all of it where it cannot."""
-        wanted = self._wanted
-        return math.copysign(1.0, wanted) if self.stuck and wanted else wanted / self.fastest
+        """Return -1 to 1: in proportion to the speed while it moves, full load where it is stuck."""
+        velocity = self._free_velocity
+        return math.copysign(1.0, velocity) if self.stuck and velocity else velocity / self.fastest
 
     @property
-    def _wanted(self) -> float:
+    def _free_velocity(self) -> float:
         if not self.driven:
             return 0.0
         if self.wheel:

@@ -1,7 +1,7 @@
 """The memory table of a simulated FEETECH servo: 256 addresses, of which the model file names some.
 
-EEPROM exists twice: what the servo works with, and what a restart brings back. A write while the lock is on changes only the
-first (feetech.md, section 9). Addresses without a register, and registers that can only be read, ignore writes.
+EEPROM exists twice: the values that the servo works with, and the stored ones that a restart brings back. A write while the lock
+is on changes only the first (SMS 1.0, 1.3.3). Addresses without a register, and registers that can only be read, ignore writes.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ BASICS = {
     "response_status_level": Register(name="response_status_level", address=8, memory="eeprom", default=1),
     "async_write_flag": Register(name="async_write_flag", address=64, access="r"),
 }
-"""The same in every table; a model file that leaves one out has it still."""
+"""These are the same in every table, so a servo has them also where its model file leaves them out."""
 
 
 class RegisterTable:
-    """Bytes by address, words by register. What may be written from the wire is `write`; `put` is the servo's own hand."""
+    """Bytes by address, values by register. `write` is a write from the wire; `put` and `store` are the servo's own changes."""
 
     __slots__ = ("_lock", "_number", "_order", "_stored", "_writable", "data", "registers")
 
@@ -41,23 +41,24 @@ class RegisterTable:
         self.restart()
 
     def get(self, register: Register) -> int:
+        """Return the raw value that the servo works with."""
         return register.decode(bytes(self.data[register.address : register.end]), self._order)
 
     def put(self, register: Register, raw: int) -> None:
-        """Change what the servo works with; what is out of range ends at the end of the range."""
+        """Change the value that the servo works with; a value out of range is replaced by the end of the range."""
         self.data[register.address : register.end] = self._word(register, raw)
 
     def store(self, register: Register, raw: int) -> None:
-        """Change it for good, whatever the lock says."""
+        """Change the stored value too, whether it is locked or not."""
         self.put(register, raw)
         self._stored[register.address : register.end] = self.data[register.address : register.end]
 
     def read(self, address: int, size: int) -> bytes:
-        """Past the last address there is nothing to answer with, so the answer is shorter."""
+        """Return these bytes; fewer where the table ends."""
         return bytes(self.data[address : address + size])
 
     def write(self, address: int, data: bytes) -> None:
-        """Byte by byte, as the wire brings it: no register is checked for its range."""
+        """Write bytes from the wire, without a check of any register's range."""
         locked = self.get(self._lock) != 0
         for at, byte in enumerate(data[: SIZE - address], address):
             if self._writable[at]:
@@ -66,14 +67,14 @@ class RegisterTable:
                     self._stored[at] = byte
 
     def restart(self) -> None:
-        """What power-on does: RAM to its defaults, EEPROM as it was stored."""
+        """Do what power-on does: RAM gets its defaults, EEPROM its stored values."""
         self.data[:] = self._stored
         for register in self.registers.values():
             if register.memory == "ram":
                 self.put(register, register.default or 0)
 
     def reset(self, keep: Register) -> None:
-        """EEPROM to factory values, for good, all but one register. RAM stays."""
+        """Store the factory values in EEPROM, except one register. RAM does not change."""
         kept = self.get(keep)
         factory = self._factory()
         for register in self.registers.values():
@@ -83,7 +84,7 @@ class RegisterTable:
         self.store(keep, kept)
 
     def _factory(self) -> bytearray:
-        """Defaults of the model file; addresses 0 to 4 say who it is, in every table."""
+        """Return the defaults of the model file; addresses 0 to 4 are the identity in every table."""
         data = bytearray(SIZE)
         for register in self.registers.values():
             if register.memory == "eeprom":
@@ -93,7 +94,7 @@ class RegisterTable:
         return data
 
     def _word(self, register: Register, raw: int) -> bytes:
-        """Not `Register.encode`: a device holds what the documents call out of range, too. Unsigned shows the magnitude."""
+        """Encode without a check: a servo can hold values outside the documented range; an unsigned one keeps the magnitude."""
         bits = 8 * register.size if register.sign_bit is None else register.sign_bit
         word = min(abs(raw), (1 << bits) - 1)
         if raw < 0 and register.sign_bit is not None:

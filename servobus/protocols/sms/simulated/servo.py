@@ -1,12 +1,12 @@
-"""What is inside a simulated FEETECH servo: a memory table and a joint, and how each moves the other (feetech.md, 2, 3, 9).
+"""The inside of a simulated FEETECH servo: a memory table and a joint, and how they act on each other.
 
-Where the documents are silent or contradict each other, it does this:
-- torque 128 stores the offset that makes this position 2048, whatever the lock says; goal and torque stay as they were;
-- a goal outside the stored angle limits ends at the limit, and the goal register keeps what was written;
-- both limits 0 mean many turns: no limit, and the position counts on past one turn;
+Where the documents are silent or contradict each other, the simulated servo behaves like this:
+- torque 128 stores the offset that makes the present position 2048, locked or not; goal and torque do not change;
+- a goal outside the stored angle limits ends at the limit, and the goal register keeps the written value;
+- both limits 0 mean many turns: there is no limit, and the position counts on after one turn;
 - modes that are neither position nor wheel (PWM, step), and torque 2 (damping), leave the joint at rest;
-- after a restart the goal register is 0 (the table's default), so torque without a goal first goes there;
-- RESET puts all EEPROM but the id back to factory values, for good, needs no unlock, and leaves RAM alone.
+- after a restart the goal register is 0 (the table's default), so torque without a new goal moves the joint there;
+- RESET stores the factory values in all EEPROM but the id, needs no unlock, and does not change RAM.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from servobus.protocols.sms.simulated.registers import SIZE, RegisterTable
 
 TORQUE_ON, CALIBRATE = 1, 128
 MIDDLE = 2048
-"""The position that CALIBRATE gives to where the servo stands."""
+"""The position that the present position becomes after CALIBRATE."""
 AMPERES_AT_FULL_LOAD = 2.0
 SETTINGS = ("torque_limit", "max_torque", "min_angle_limit", "max_angle_limit", "mode", "position_offset")
-"""Beside goal, torque and wheel registers, these have a say in what the joint does."""
+"""These registers act on the joint too, beside goal, torque and the wheel registers."""
 
 
 class SimulatedServo:
@@ -35,7 +35,7 @@ class SimulatedServo:
         self.baudrate = baudrate
         self.voltage = 12.0
         self.faults = 0
-        """The health byte (feetech.md, section 6): in each answer and in register 65."""
+        """The health byte (SMS 1.0, 1.2): in each reply and in register 65."""
         self.memory = RegisterTable(model)
         self._registers = self.memory.registers
         self._offset = 0
@@ -47,8 +47,8 @@ class SimulatedServo:
         self._configure(baudrate, response_level)
         self._wake()
 
-    def look(self, address: int, size: int, now: float) -> bytes:
-        """What a READ brings. What the servo measures is measured now."""
+    def read_table(self, address: int, size: int, now: float) -> bytes:
+        """Return the bytes of a READ. Measured registers are measured now."""
         end = address + size
         for register, measure in self._live:
             if register.address < end and register.end > address:
@@ -57,7 +57,7 @@ class SimulatedServo:
         return self.memory.read(address, min(size, MAX_PARAMETERS))
 
     def apply(self, address: int, data: bytes, now: float) -> None:
-        """A WRITE that takes effect now. Writing the goal position switches torque on by itself."""
+        """Carry out a WRITE. Writing the goal position switches torque on."""
         self.joint.advance(now)
         end = min(SIZE, address + len(data))
         torque, goal = self._registers[self.model.torque], self._registers[self.model.goal[0]]
@@ -74,39 +74,40 @@ class SimulatedServo:
             self._steer()
 
     def reset(self, now: float) -> None:
-        """Factory values."""
+        """Return to factory values."""
         self.joint.advance(now)
         self.memory.reset(self._registers["id"])
         self._adopt()
         self._steer()
 
     def restart(self, now: float) -> None:
-        """Power off and on: the joint stays where it is, what was not stored is lost, turns are no longer counted."""
+        """Switch power off and on: the joint does not move, unstored values and the count of turns are lost."""
         self.joint.advance(now)
         self.joint.position %= self.joint.turn
         self.memory.restart()
         self._wake()
 
     def get(self, name: str) -> int:
-        """Raw value; 0 where this model has no such register."""
+        """Return a raw value; 0 where this model has no such register."""
         register = self._registers.get(name)
         return self.memory.get(register) if register else 0
 
-    # What measurements are made of
+    # Measurements
 
     def reported(self) -> float:
+        """Return the position as the servo reports it."""
         position = round(self.joint.position)
         return position % self.joint.turn if self.joint.wraps else position
 
     def load(self) -> float:
-        """Percent, at most the torque limit."""
-        most = self._torque_limit() / 1000
-        return 100 * max(-most, min(most, self.joint.load))
+        """Return the load in percent, at most the torque limit."""
+        limit = self._torque_limit() / 1000
+        return 100 * max(-limit, min(limit, self.joint.load))
 
     # From registers to the joint
 
     def _steer(self) -> None:
-        """Make the joint do what the registers say now."""
+        """Make the joint follow the registers."""
         joint, wheel = self.joint, self._is_wheel()
         offset = self.get("position_offset")
         joint.position += self._offset - offset
@@ -118,10 +119,10 @@ class SimulatedServo:
         goal = self.get(self.model.goal[0])
         joint.target = goal if limits == (0, 0) else max(limits[0], min(limits[1], goal))
         joint.driven = self.get(self.model.torque) == TORQUE_ON and self._torque_limit() > 0 and (wheel or not self.get("mode"))
-        joint.rate = self._pace(wheel)
+        joint.rate = self._rate(wheel)
 
-    def _pace(self, wheel: bool) -> float:
-        """Steps/s. Speed 0 is rest for a wheel; else the time word rules, where the model has one, or nothing limits it."""
+    def _rate(self, wheel: bool) -> float:
+        """Return steps/s. Speed 0 is rest in wheel mode; else the time register counts, where the model has one, or no limit."""
         fastest = self.joint.fastest
         time, speed = (self._registers[name] for name in self.model.goal[1:3])
         rate = self.memory.get(speed) * speed.scale
@@ -130,15 +131,15 @@ class SimulatedServo:
         if rate:
             return min(fastest, abs(rate))
         milliseconds = self.memory.get(time) if self.model.time_is_ms else 0
-        way = abs(self.joint.target - self.joint.position)
-        return min(fastest, 1000 * way / milliseconds) if milliseconds else fastest
+        distance = abs(self.joint.target - self.joint.position)
+        return min(fastest, 1000 * distance / milliseconds) if milliseconds else fastest
 
     def _is_wheel(self) -> bool:
         wheel = self.model.wheel
         return wheel is not None and all(self.get(name) == value for name, value in wheel.registers.items())
 
     def _torque_limit(self) -> int:
-        """0.1 %."""
+        """Return the torque limit in 0.1 %."""
         return self.get("torque_limit" if "torque_limit" in self._registers else "max_torque")
 
     def _calibrate(self) -> None:
@@ -159,7 +160,7 @@ class SimulatedServo:
     # Id and baud rate
 
     def _configure(self, baudrate: int, response_level: int) -> None:
-        """What somebody stored before. A rate that has no code takes the place of the factory's."""
+        """Store id, rate and response level. A rate that has no code replaces the factory's."""
         register = self._registers["baud_rate"]
         codes = [code for code, rate in self._rates.items() if rate == baudrate]
         code = codes[0] if codes else register.default or 0
@@ -168,7 +169,7 @@ class SimulatedServo:
             self.memory.store(self._registers[name], raw)
 
     def _adopt(self) -> None:
-        """Be called as the registers say, at once; what is no id or no baud code changes nothing."""
+        """Use the id and the baud rate of the registers at once; values that are not valid change nothing."""
         if (servo_id := self.get("id")) <= MAX_ID:
             self.node = servo_id
         self.memory.put(self._registers["id"], self.node)
@@ -183,13 +184,13 @@ class SimulatedServo:
 
 LIVE: dict[str, Callable[[SimulatedServo], float]] = {
     "present_position": SimulatedServo.reported,
-    "present_speed": lambda body: body.joint.velocity,
+    "present_speed": lambda servo: servo.joint.velocity,
     "present_load": SimulatedServo.load,
-    "present_voltage": lambda body: body.voltage,
-    "present_temperature": lambda body: body.joint.temperature,
-    "servo_status": lambda body: body.faults,
-    "moving": lambda body: body.joint.velocity != 0,
-    "present_goal_position": lambda body: body.joint.target,
-    "present_current": lambda body: abs(body.load()) / 100 * AMPERES_AT_FULL_LOAD,
+    "present_voltage": lambda servo: servo.voltage,
+    "present_temperature": lambda servo: servo.joint.temperature,
+    "servo_status": lambda servo: servo.faults,
+    "moving": lambda servo: servo.joint.velocity != 0,
+    "present_goal_position": lambda servo: servo.joint.target,
+    "present_current": lambda servo: abs(servo.load()) / 100 * AMPERES_AT_FULL_LOAD,
 }
 """Registers that are measured when they are read, in physical units."""

@@ -30,7 +30,7 @@ def test_what_can_only_be_read_ignores_writes(master: Master) -> None:
     assert master.read("servo_status") == 0
     master.say(Instruction.WRITE, b"\x03\x63\x63\x05")
     assert master.device.node == 5
-    assert b"\x63" not in master.device.look(0, 5, 0.0)
+    assert b"\x63" not in master.device.read_table(0, 5, 0.0)
 
 
 def test_beyond_the_last_address_there_is_nothing(master: Master) -> None:
