@@ -34,28 +34,28 @@ def refusing(request: Request[Any]) -> int:
 
 
 def total(*numbers: int) -> Plan[int]:
-    found = 0
+    result = 0
     for number in numbers:
-        found += yield from ask(Number(number))
-    return found
+        result += yield from ask(Number(number))
+    return result
 
 
 def test_a_plan_is_sent_what_its_requests_return() -> None:
-    said: list[int] = []
+    sent: list[int] = []
 
     def exchange(request: Request[Any]) -> int:
-        said.append(numbered(request))
+        sent.append(numbered(request))
         return 10 * numbered(request)
 
     assert run_plan(total(1, 2, 3), exchange) == 60
-    assert said == [1, 2, 3]
+    assert sent == [1, 2, 3]
 
 
-def test_a_plan_may_say_nothing() -> None:
+def test_a_plan_may_be_empty() -> None:
     assert run_plan(total(), refusing) == 0
 
 
-def test_an_error_goes_into_the_plan_which_may_go_on() -> None:
+def test_an_error_enters_the_plan_which_may_go_on() -> None:
     def careful() -> Plan[str]:
         try:
             yield from ask(Number(1))
@@ -67,13 +67,13 @@ def test_an_error_goes_into_the_plan_which_may_go_on() -> None:
     assert run_plan(careful(), numbered) == "answered"
 
 
-def test_an_error_that_a_plan_does_not_take_ends_it() -> None:
+def test_an_uncaught_error_ends_the_plan() -> None:
     with pytest.raises(ReplyTimeout, match="no answer to 1"):
         run_plan(total(1, 2), refusing)
 
 
-def test_a_plan_may_say_more_after_an_error() -> None:
-    said: list[int] = []
+def test_a_plan_may_send_more_after_an_error() -> None:
+    sent: list[int] = []
 
     def tidy() -> Plan[int]:
         try:
@@ -83,17 +83,17 @@ def test_a_plan_may_say_more_after_an_error() -> None:
             raise
 
     def exchange(request: Request[Any]) -> int:
-        said.append(numbered(request))
-        if said == [1, 2]:
+        sent.append(numbered(request))
+        if sent == [1, 2]:
             raise LinkDown("gone")
         return 0
 
     with pytest.raises(LinkDown, match="gone"):
         run_plan(tidy(), exchange)
-    assert said == [1, 2, 9]
+    assert sent == [1, 2, 9]
 
 
-def test_a_mistake_in_the_exchange_is_no_answer_of_the_plan() -> None:
+def test_a_bug_in_the_exchange_does_not_enter_the_plan() -> None:
     def broken(request: Request[Any]) -> int:
         raise ZeroDivisionError
 
@@ -107,7 +107,7 @@ def test_a_mistake_in_the_exchange_is_no_answer_of_the_plan() -> None:
         run_plan(deaf(), broken)
 
 
-def test_what_a_request_is_unless_it_says_otherwise() -> None:
+def test_the_defaults_of_a_request() -> None:
     request = Number(1)
     assert (request.replies, request.idempotent, request.partial) == (1, True, False)
     assert (request.quiet_after, request.service_time) == (0.0, 0.0)

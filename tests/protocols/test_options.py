@@ -14,7 +14,7 @@ BUS = {"protocol": "sms", "port": "sim:", "baudrate": 115200}
 
 
 @pytest.mark.parametrize(
-    ("keys", "told"),
+    ("keys", "message"),
     [
         ({"limits": [5, 5]}, "the first must be below the second"),
         ({"limits": [0, float("inf")]}, "must be a finite number"),
@@ -37,8 +37,8 @@ BUS = {"protocol": "sms", "port": "sim:", "baudrate": 115200}
         ({"speeed": 1}, "Extra inputs"),
     ],
 )
-def test_what_does_not_fit(keys: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValidationError, match=told):
+def test_what_does_not_fit(keys: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         ServoOptions.model_validate({"id": 1, **keys})
 
 

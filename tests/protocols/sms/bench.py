@@ -1,4 +1,4 @@
-"""A driver and simulated servos, joined without line, loop or clock: each request is heard, answered and parsed at once."""
+"""A driver and simulated servos, joined without line, loop or clock: each request is received, answered and parsed at once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TWO = {"a": {"id": 1, "model": "sts"}, "b": {"id": 2, "model": "sts"}}
 
 
 class Bench:
-    """`said` are the frames in order; `deaf` may name requests that get lost on the way."""
+    """`sent` are the frames in order; `is_lost` may name requests that get lost on the way."""
 
     def __init__(self, servos: Mapping[str, Mapping[str, Any]] = TWO, *, sts: SmsModel | None = None, **keys: Any) -> None:
         data = {"protocol": "sms", "port": "sim:", "baudrate": 1_000_000, "servos": servos, **keys}
@@ -29,20 +29,20 @@ class Bench:
         models = {**packaged_models(), "sts": sts or packaged_models()["sts"]}
         self.driver = SmsDriver(self.options, models)
         self.devices: dict[int, SmsDevice] = {device.node: device for device in devices(self.options, models)}
-        self.said: list[Packet] = []
-        self.deaf: Callable[[Packet], bool] = lambda packet: False
-        self.mute: Callable[[Packet], bool] = lambda packet: False
+        self.sent: list[Packet] = []
+        self.is_lost: Callable[[Packet], bool] = lambda packet: False
+        self.is_unanswered: Callable[[Packet], bool] = lambda packet: False
         """Heard and obeyed, but the answer gets lost."""
         self.now = 0.0
 
     def exchange(self, request: Request[Any]) -> Any:
         packet = packet_of(request.frame)
-        self.said.append(packet)
-        heard = []
-        if not self.deaf(packet):
+        self.sent.append(packet)
+        received = []
+        if not self.is_lost(packet):
             replies = [reply for device in self.devices.values() for reply in device.handle(packet, self.now)]
-            heard = [packet_of(reply.data) for reply in sorted(replies, key=lambda reply: reply.slot)]
-        answers = [] if self.mute(packet) else [reply for reply in heard if request.answers(reply)]
+            received = [packet_of(reply.data) for reply in sorted(replies, key=lambda reply: reply.slot)]
+        answers = [] if self.is_unanswered(packet) else [reply for reply in received if request.answers(reply)]
         if len(answers) < request.replies:
             raise ReplyTimeout("no answer", request=request)
         return request.parse(answers[: request.replies])
@@ -57,7 +57,7 @@ class Bench:
     def enable(self, *servos: str) -> None:
         for servo in servos or self.driver.nodes:
             self.run(self.driver.enable(servo))
-        self.said.clear()
+        self.sent.clear()
 
     def move(self, goals: Mapping[str, float | Goal], *, together: bool = False, confirm: bool = False) -> Results:
         """Plan and run; the results of all turns."""
@@ -68,7 +68,7 @@ class Bench:
         return results
 
     def instructions(self) -> list[str]:
-        return [Instruction(packet.code).name for packet in self.said]
+        return [Instruction(packet.code).name for packet in self.sent]
 
     def register(self, node: int, name: str) -> int:
         return self.devices[node].get(name)

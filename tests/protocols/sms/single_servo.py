@@ -1,4 +1,4 @@
-"""A master of one simulated FEETECH servo, that owns the time."""
+"""A master of one simulated FEETECH servo; it owns the time."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def packet_of(frame: bytes) -> Packet:
 
 
 class Master:
-    """Speaks to one device, and owns the time."""
+    """Sends packets to one device, and owns the time."""
 
     def __init__(self, device: SmsDevice) -> None:
         self.device = device
         self.model = device.model
         self.now = 0.0
 
-    def say(self, code: int, params: bytes = b"", *, to: int | None = None) -> Packet | None:
-        """What comes back, if anything does."""
+    def send(self, code: int, params: bytes = b"", *, to: int | None = None) -> Packet | None:
+        """Send a packet and return the reply; None: there is none."""
         frame = encode(self.device.node if to is None else to, code, params)
         replies = self.device.handle(packet_of(frame), self.now)
         assert len(replies) <= 1
@@ -38,18 +38,18 @@ class Master:
         return self.model.registers[name].encode(raw, self.model.byte_order)
 
     def write(self, name: str, raw: int) -> Packet | None:
-        return self.say(Instruction.WRITE, bytes((self.model.registers[name].address,)) + self.bytes_of(name, raw))
+        return self.send(Instruction.WRITE, bytes((self.model.registers[name].address,)) + self.bytes_of(name, raw))
 
     def read(self, name: str) -> int:
         register = self.model.registers[name]
-        reply = self.say(Instruction.READ, bytes((register.address, register.size)))
+        reply = self.send(Instruction.READ, bytes((register.address, register.size)))
         assert reply is not None
         return register.decode(reply.params, self.model.byte_order)
 
     def go(self, position: int, *, time: int = 0, speed: int = 0) -> None:
-        words = zip(self.model.goal, (position, time, speed), strict=True)
-        data = b"".join(self.bytes_of(name, raw) for name, raw in words)
-        assert self.say(Instruction.WRITE, bytes((self.model.registers[self.model.goal[0]].address,)) + data) is not None
+        values = zip(self.model.goal, (position, time, speed), strict=True)
+        data = b"".join(self.bytes_of(name, raw) for name, raw in values)
+        assert self.send(Instruction.WRITE, bytes((self.model.registers[self.model.goal[0]].address,)) + data) is not None
 
     def after(self, seconds: float) -> Master:
         self.now += seconds

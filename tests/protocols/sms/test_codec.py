@@ -17,14 +17,14 @@ PING = encode(1, 1)
 ANSWER = encode(1, 0, b"\x18\x05")
 
 
-def heard(*chunks: bytes) -> list[Packet]:
+def decoded(*chunks: bytes) -> list[Packet]:
     codec = SmsCodec()
-    found = []
+    packets = []
     for chunk in chunks:
         codec.receive_data(chunk)
         while (packet := codec.next_reply()) is not None:
-            found.append(packet)
-    return found
+            packets.append(packet)
+    return packets
 
 
 @pytest.mark.parametrize(("request_", "text"), REQUESTS.values(), ids=REQUESTS)
@@ -33,21 +33,21 @@ def test_requests_are_the_frames_of_the_document(request_: Request[Any], text: s
 
 
 @pytest.mark.parametrize(("request_", "text"), REQUESTS.values(), ids=REQUESTS)
-def test_they_are_understood(request_: Request[Any], text: str) -> None:
-    (packet,) = heard(bytes.fromhex(text))
+def test_the_frames_are_understood(request_: Request[Any], text: str) -> None:
+    (packet,) = decoded(bytes.fromhex(text))
     assert packet.id == request_.node
     assert encode(packet.id, packet.code, packet.params) == packet.frame == request_.frame
 
 
 @pytest.mark.parametrize(("request_", "text", "value"), REPLIES.values(), ids=REPLIES)
 def test_replies_of_the_document_answer(request_: Request[Any], text: str, value: object) -> None:
-    (packet,) = heard(bytes.fromhex(text))
+    (packet,) = decoded(bytes.fromhex(text))
     assert request_.answers(packet)
     assert request_.parse([packet]) == value
 
 
-def test_what_a_packet_says() -> None:
-    (packet,) = heard(encode(5, 0x20, b"\x01\x02"))
+def test_the_parts_of_a_packet() -> None:
+    (packet,) = decoded(encode(5, 0x20, b"\x01\x02"))
     assert (packet.node, packet.status, packet.key, packet.params) == (5, 0x20, 2, b"\x01\x02")
     assert node_of(packet.frame) == 5
     assert checksum(b"\xfe\x02\x05") == 0xFA
@@ -55,12 +55,12 @@ def test_what_a_packet_says() -> None:
 
 @pytest.mark.parametrize("cut", range(1, len(ANSWER)))
 def test_cut_anywhere(cut: int) -> None:
-    assert heard(ANSWER[:cut], ANSWER[cut:]) == heard(ANSWER)
+    assert decoded(ANSWER[:cut], ANSWER[cut:]) == decoded(ANSWER)
 
 
 def test_byte_by_byte() -> None:
     stream = PING + ANSWER + encode(0, 0xFF, b"\xff" * 5)
-    assert [packet.frame for packet in heard(*(bytes((byte,)) for byte in stream))] == [
+    assert [packet.frame for packet in decoded(*(bytes((byte,)) for byte in stream))] == [
         PING,
         ANSWER,
         encode(0, 0xFF, b"\xff" * 5),
@@ -69,22 +69,22 @@ def test_byte_by_byte() -> None:
 
 @pytest.mark.parametrize("junk", [b"\x00", b"\xff", b"\xff\xff", b"\xff\xff\xff\xff", b"\x55\xaa\xff", b"\xff\x00\xff"])
 def test_junk_before_a_packet_is_skipped(junk: bytes) -> None:
-    assert [packet.frame for packet in heard(junk + ANSWER)] == [ANSWER]
-    assert [packet.frame for packet in heard(junk, ANSWER)] == [ANSWER]
+    assert [packet.frame for packet in decoded(junk + ANSWER)] == [ANSWER]
+    assert [packet.frame for packet in decoded(junk, ANSWER)] == [ANSWER]
 
 
-def test_a_wrong_sum_hides_no_packet_behind_it() -> None:
+def test_a_packet_after_a_wrong_checksum_is_decoded() -> None:
     wrong = ANSWER[:-1] + bytes((ANSWER[-1] ^ 1,))
-    assert [packet.frame for packet in heard(wrong + ANSWER)] == [ANSWER]
+    assert [packet.frame for packet in decoded(wrong + ANSWER)] == [ANSWER]
 
 
-def test_a_packet_inside_a_broken_one_is_found() -> None:
+def test_a_packet_inside_a_broken_one_is_decoded() -> None:
     long = encode(3, 0, bytes(40))
-    assert [packet.frame for packet in heard(long[:20] + ANSWER + bytes(60))] == [ANSWER]
+    assert [packet.frame for packet in decoded(long[:20] + ANSWER + bytes(60))] == [ANSWER]
 
 
 @pytest.mark.parametrize("head", [b"\xff\xff\xff\x02", b"\xff\xff\x01\x00", b"\xff\xff\x01\x01"])
-def test_a_head_that_can_be_none_is_no_head(head: bytes) -> None:
+def test_an_impossible_header_is_skipped(head: bytes) -> None:
     codec = SmsCodec()
     codec.receive_data(head + bytes(4))
     assert codec.next_reply() is None
@@ -95,7 +95,7 @@ def test_a_head_that_can_be_none_is_no_head(head: bytes) -> None:
 def test_the_longest_packet_and_one_more() -> None:
     longest = encode(1, 3, bytes(MAX_PARAMETERS))
     assert len(longest) == 259
-    assert heard(longest)[0].frame == longest
+    assert decoded(longest)[0].frame == longest
     with pytest.raises(ValueError, match="254 parameters do not fit"):
         encode(1, 3, bytes(MAX_PARAMETERS + 1))
 
@@ -118,21 +118,21 @@ def test_memory_is_bounded() -> None:
 
 
 @given(st.integers(0, 253), st.integers(0, 255), st.binary(max_size=MAX_PARAMETERS), st.binary(max_size=3))
-def test_what_is_encoded_is_heard(servo: int, code: int, params: bytes, junk: bytes) -> None:
+def test_encoded_packets_are_decoded(servo: int, code: int, params: bytes, junk: bytes) -> None:
     frame = encode(servo, code, params)
-    assert (servo, code, params, frame) in heard(junk + frame + frame) or junk.endswith(b"\xff") or b"\xff\xff" in junk
-    assert heard(frame) == [(servo, code, params, frame)]
+    assert (servo, code, params, frame) in decoded(junk + frame + frame) or junk.endswith(b"\xff") or b"\xff\xff" in junk
+    assert decoded(frame) == [(servo, code, params, frame)]
 
 
 @given(st.integers(0, 253), st.binary(max_size=20), st.integers(0, 10_000))
 def test_renaming_changes_the_id_and_nothing_else(servo: int, params: bytes, seed: int) -> None:
-    (packet,) = heard(rename(encode(servo, 0, params), random.Random(seed)))
+    (packet,) = decoded(rename(encode(servo, 0, params), random.Random(seed)))
     assert packet.id != servo
     assert packet.params == params
 
 
 @pytest.mark.parametrize(
-    ("frame", "sent", "words"),
+    ("frame", "sent", "text"),
     [
         (PING, True, "id 1 PING"),
         (encode(0xFE, 5), True, "all ACTION"),
@@ -148,5 +148,5 @@ def test_renaming_changes_the_id_and_nothing_else(servo: int, params: bytes, see
         (PING + b"\x00", True, "no SMS packet: ff ff 01 02 01 fb 00"),
     ],
 )
-def test_packets_in_words(frame: bytes, sent: bool, words: str) -> None:
-    assert describe(frame, sent=sent) == SmsCodec().describe(frame, sent=sent) == words
+def test_packets_are_described(frame: bytes, sent: bool, text: str) -> None:
+    assert describe(frame, sent=sent) == SmsCodec().describe(frame, sent=sent) == text

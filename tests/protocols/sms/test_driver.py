@@ -1,4 +1,4 @@
-"""The FEETECH driver's verbs on simulated servos: what is said, in which order, and what is refused without a word."""
+"""The FEETECH driver's verbs on simulated servos: what is sent, in which order, and what is refused before a frame leaves."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def test_enable_makes_the_present_position_the_goal_before_torque(model: str) ->
     assert present == pytest.approx((700 - zero) * unit)
     assert (bench.register(1, "goal_position"), bench.register(1, "torque_enable")) == (700, 1)
     registers = device.model.registers
-    written = [packet.params[0] for packet in bench.said if packet.code == Instruction.WRITE]
+    written = [packet.params[0] for packet in bench.sent if packet.code == Instruction.WRITE]
     assert written.index(registers["goal_position"].address) < written.index(registers["torque_enable"].address)
     sentinel = device.model.sentinel
     assert bench.register(1, sentinel.name) == sentinel.value != sentinel.reset
 
 
-def test_enable_of_a_wheel_says_speed_0() -> None:
+def test_enable_of_a_wheel_writes_speed_0() -> None:
     bench = Bench()
     device = bench.devices[1]
     device.memory.store(device.memory.registers["mode"], 1)
@@ -49,9 +49,9 @@ def test_enable_of_a_wheel_says_speed_0() -> None:
 
 def test_enable_that_does_not_read_back_fails() -> None:
     bench = Bench()
-    bench.deaf = lambda packet: False
+    bench.is_lost = lambda packet: False
     device = bench.devices[1]
-    bench.mute = meddle(device, 0)
+    bench.is_unanswered = meddle(device, 0)
     with pytest.raises(DeviceError, match="it stays disabled"):
         bench.run(bench.driver.enable("a"))
 
@@ -63,7 +63,7 @@ def test_disable_reads_back() -> None:
     assert (report.action, report.written, report.confirmed) == ("limp", True, True)
     assert bench.register(1, "torque_enable") == 0
     device = bench.devices[1]
-    bench.mute = meddle(device, 1)
+    bench.is_unanswered = meddle(device, 1)
     report = bench.run(bench.driver.disable("a"))
     assert (report.confirmed, report.detail) == (False, "torque still reads on")
 
@@ -89,7 +89,7 @@ def test_enable_asks_for_the_mode_anew() -> None:
 def test_an_enable_that_fails_half_way_ends_with_torque_off() -> None:
     bench = Bench()
     torque = bytes((40, 1))
-    bench.mute = lambda packet: packet.code == Instruction.READ and packet.params == torque
+    bench.is_unanswered = lambda packet: packet.code == Instruction.READ and packet.params == torque
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.enable("a"))
     assert bench.register(1, "torque_enable") == 0
@@ -105,7 +105,7 @@ def test_eeprom_of_an_energised_servo_is_not_written() -> None:
 
 def test_a_lost_answer_to_the_unlock_leaves_nothing_unlocked() -> None:
     bench = Bench()
-    bench.mute = lambda packet: packet.code == Instruction.WRITE and packet.params == bytes((LOCK, 0))
+    bench.is_unanswered = lambda packet: packet.code == Instruction.WRITE and packet.params == bytes((LOCK, 0))
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.write_register("a", "return_delay", 100, raw=True, persist=True))
     assert bench.register(1, "lock") == 1
@@ -114,7 +114,7 @@ def test_a_lost_answer_to_the_unlock_leaves_nothing_unlocked() -> None:
 # Fences
 
 
-def test_a_fence_has_a_length_that_nothing_under_way_has() -> None:
+def test_a_fence_has_a_length_that_is_not_under_way() -> None:
     assert choose_key(FENCE_SIZES, []) == 3
     assert choose_key(FENCE_SIZES, [3, 4, 2, "x"]) == 5
     everything = [7, *[size for size in FENCE_SIZES if size != 7]]
@@ -122,34 +122,34 @@ def test_a_fence_has_a_length_that_nothing_under_way_has() -> None:
     assert 2 not in FENCE_SIZES, "the echo of a READ has two parameters"
 
 
-def test_recovery_asks_for_the_id_and_for_the_sentinel_of_what_was_enabled() -> None:
+def test_a_fence_reads_the_id_and_the_sentinel() -> None:
     bench = Bench()
     assert bench.run(bench.driver.fence(1, [3], ()))
-    assert [packet.params.hex(" ") for packet in bench.said] == ["05 04"]
+    assert [packet.params.hex(" ") for packet in bench.sent] == ["05 04"]
     bench.enable()
     assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
-    assert [packet.params.hex(" ") for packet in bench.said] == ["05 03", "29 01"]
+    assert [packet.params.hex(" ") for packet in bench.sent] == ["05 03", "29 01"]
     bench.devices[1].reboot(0.0)
     bench.now = 100.0
     assert not bench.run(bench.driver.fence(1, [], bench.driver.nodes)), "it has restarted"
-    bench.said.clear()
-    bench.deaf = lambda packet: True
+    bench.sent.clear()
+    bench.is_lost = lambda packet: True
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.fence(1, [3], bench.driver.nodes))
-    assert [packet.params[1] for packet in bench.said] == [4, 5], "never the same length twice"
+    assert [packet.params[1] for packet in bench.sent] == [4, 5], "never the same length twice"
 
 
-def test_a_servo_nobody_configured_can_be_fenced_too() -> None:
+def test_an_unconfigured_servo_can_be_fenced() -> None:
     bench = Bench()
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.fence(99, [], bench.driver.nodes))
 
 
-def test_ping_and_a_question_nobody_answers() -> None:
+def test_ping_and_an_unused_id() -> None:
     bench = Bench()
     assert bench.ask(bench.driver.ping(1)) == 0
     with pytest.raises(ReplyTimeout):
         bench.ask(bench.driver.unused())
-    assert bench.said[-1].id == 253
+    assert bench.sent[-1].id == 253
     full = Bench({f"s{number}": {"id": number, "model": "sts"} for number in range(1, 254)})
     assert full.driver.unused().node == 0

@@ -27,53 +27,53 @@ def test_position_time_and_speed(goal: Goal, values: tuple[int, int, int]) -> No
     bench = Bench()
     bench.enable()
     bench.move({"a": goal})
-    data = bench.said[0].params[1:]
+    data = bench.sent[0].params[1:]
     assert tuple(int.from_bytes(data[at : at + 2], "little") for at in (0, 2, 4)) == values
 
 
-def test_an_scs_has_a_time_of_its_own() -> None:
+def test_an_scs_takes_a_time() -> None:
     bench = Bench({"s": {"id": 1, "model": "scs"}})
     bench.enable()
     bench.move({"s": Goal("position", 10, duration=1.5)})
-    assert bench.said[0].params.hex(" ") == "2a 02 2f 05 dc 00 00"
-    bench.said.clear()
+    assert bench.sent[0].params.hex(" ") == "2a 02 2f 05 dc 00 00"
+    bench.sent.clear()
     bench.move({"s": Goal("position", 10, speed=45)})
-    assert bench.said[0].params.hex(" ") == "2a 02 2f 00 01 00 d1", "the time word is 1 while speed rules: so a restart shows"
+    assert bench.sent[0].params.hex(" ") == "2a 02 2f 00 01 00 d1", "the time word is 1 while speed rules: so a restart shows"
 
 
 @pytest.mark.parametrize(
     ("speed", "raw"), [({"speed": 45}, 512), ({"max_speed": 90}, 1024), ({"speed": 45, "max_speed": 90}, 512), ({}, 1000)]
 )
-def test_whose_speed_rules(speed: dict[str, float], raw: int) -> None:
+def test_whose_speed_counts(speed: dict[str, float], raw: int) -> None:
     bench = Bench({"a": {"id": 1, "model": "sts", **speed}})
     bench.enable()
     bench.move({"a": 10})
-    assert int.from_bytes(bench.said[0].params[5:7], "little") == raw
+    assert int.from_bytes(bench.sent[0].params[5:7], "little") == raw
 
 
-def test_speed_0_needs_leave() -> None:
+def test_speed_0_needs_allow_max_speed() -> None:
     bench = Bench()
     with pytest.raises(LimitError, match="allow_max_speed"):
         bench.driver.check_goal(ServoGoal("a", Goal("position", 0, speed=0)))
     free = Bench({"a": {"id": 1, "model": "sts", "allow_max_speed": True}})
     free.enable()
     free.move({"a": Goal("position", 0, speed=0)})
-    assert free.said[0].params[5:7] == b"\0\0"
+    assert free.sent[0].params[5:7] == b"\0\0"
 
 
-def test_effort_and_acceleration_stand_beside_the_goal() -> None:
+def test_effort_and_acceleration_travel_with_the_goal() -> None:
     bench = Bench({"a": {"id": 1, "model": "sts", "acceleration": 500, "torque_limit": 50}})
     bench.enable()
     assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (57, 500)
     bench.move({"a": Goal("position", 1, effort=20, acceleration=1000)})
-    assert bench.said[0].params[0] == 41
+    assert bench.sent[0].params[0] == 41
     assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (114, 200)
     bench.move({"a": 2})
     assert (bench.register(1, "acceleration"), bench.register(1, "torque_limit")) == (57, 500), "the config's again"
 
 
 @pytest.mark.parametrize(("position", "right"), [(2699.9, True), (2700.1, False), (-3059.9, True), (-3060.1, False)])
-def test_the_wires_own_limits(position: float, right: bool) -> None:
+def test_the_limits_of_the_goal_register(position: float, right: bool) -> None:
     bench = Bench()
     goal = ServoGoal("a", Goal("position", position))
     if right:
@@ -95,12 +95,12 @@ def test_a_duration_needs_a_start() -> None:
         bench.driver.plan_goals([ServoGoal("a", Goal("position", 1, duration=1))], together=False, confirm=False)
 
 
-def test_a_model_without_a_flag_cannot_confirm_without_acknowledgements() -> None:
+def test_no_flag_and_no_acknowledgement_means_no_confirm() -> None:
     bench = Bench(sts=changed("sts", async_write_flag=None), status_return="read_only")
     bench.enable()
     with pytest.raises(NotSupported, match="its REG WRITE flag cannot be read"):
         bench.move({"a": 1, "b": 1}, confirm=True)
-    assert bench.said == []
+    assert bench.sent == []
 
 
 def test_a_model_without_a_wheel_takes_positions_only() -> None:
@@ -110,7 +110,7 @@ def test_a_model_without_a_wheel_takes_positions_only() -> None:
         bench.driver.check_goal(ServoGoal("a", Goal("velocity", 1)))
 
 
-def test_a_wheels_acceleration_stands_too_far_from_its_speed() -> None:
+def test_a_wheels_acceleration_is_not_beside_its_speed() -> None:
     bench = Bench()
     device = bench.devices[1]
     device.memory.store(device.memory.registers["mode"], 1)

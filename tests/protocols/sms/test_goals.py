@@ -15,18 +15,18 @@ FLAG = 64
 
 
 def writes_of(bench: Bench, code: Instruction) -> list[Packet]:
-    return [packet for packet in bench.said if packet.code == code]
+    return [packet for packet in bench.sent if packet.code == code]
 
 
-def test_the_frame_of_the_design() -> None:
+def test_the_documented_frame_of_a_goal() -> None:
     bench = Bench({"elbow": {"id": 2, "model": "sts", "zero": 2048, "direction": -1}})
     bench.enable()
     assert bench.move({"elbow": 30}) == {"elbow": Outcome.ACKED}
-    assert [packet.frame.hex(" ").upper() for packet in bench.said] == ["FF FF 02 09 03 2A AB 06 00 00 E8 03 2B"]
+    assert [packet.frame.hex(" ").upper() for packet in bench.sent] == ["FF FF 02 09 03 2A AB 06 00 00 E8 03 2B"]
     assert bench.register(2, "goal_position") == 1707
 
 
-def test_several_are_one_sync_write() -> None:
+def test_several_goals_are_one_sync_write() -> None:
     bench = Bench()
     bench.enable()
     assert bench.move({"a": 10, "b": -10}) == {"a": Outcome.SENT, "b": Outcome.SENT}
@@ -56,21 +56,21 @@ def test_different_spans_are_reg_write_and_action() -> None:
     assert bench.move(goals) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
     assert bench.instructions() == ["REG_WRITE", "REG_WRITE", "ACTION"]
     assert {packet.id: packet.params[0] for packet in writes_of(bench, Instruction.REG_WRITE)} == {1: 41, 2: 42}
-    bench.said.clear()
+    bench.sent.clear()
     bench.move(goals)
     assert bench.instructions() == ["SYNC_WRITE"], "the servo holds the acceleration now"
 
 
 @pytest.mark.parametrize(("count", "frames"), [(17, 1), (18, 2), (34, 2), (35, 3)])
-def test_sync_write_is_split_at_its_greatest_size(count: int, frames: int) -> None:
+def test_sync_write_is_split_at_its_maximum_size(count: int, frames: int) -> None:
     """128 bytes hold 8 + 17 x 7."""
     bench = Bench(dict(list(MANY.items())[:count]))
     bench.enable()
     results = bench.move(dict.fromkeys(bench.driver.nodes, 1.0))
     assert set(results.values()) == {Outcome.SENT} or frames > 1
     assert len(results) == count
-    assert len(bench.said) == frames
-    assert all(len(packet.frame) <= 128 for packet in bench.said)
+    assert len(bench.sent) == frames
+    assert all(len(packet.frame) <= 128 for packet in bench.sent)
 
 
 @pytest.mark.parametrize(("baudrate", "size"), [(115_200, 115), (1_000_000, 128), (9600, 9)])
@@ -79,7 +79,7 @@ def test_no_frame_holds_the_line_longer_than_allowed(baudrate: int, size: int) -
     assert size * 10 / baudrate <= MAX_FRAME_SECONDS
 
 
-def test_never_below_one_servo() -> None:
+def test_a_frame_carries_at_least_one_servo() -> None:
     bench = Bench(baudrate=9600)
     bench.enable()
     assert set(bench.move({"a": 1, "b": 1}).values()) == {Outcome.ACKED}
@@ -100,53 +100,53 @@ def test_together_beyond_one_frame_is_reg_write_and_action() -> None:
 # A servo that does not acknowledge
 
 
-def test_action_is_withheld_and_who_was_armed_is_disarmed() -> None:
+def test_action_is_withheld_and_armed_servos_are_disarmed() -> None:
     bench = Bench()
     bench.enable()
     goals = bench.register(1, "goal_position"), bench.register(2, "goal_position")
-    bench.deaf = lambda packet: packet.id == 2
+    bench.is_lost = lambda packet: packet.id == 2
     results = bench.move({"a": 10, "b": 10}, confirm=True)
     assert isinstance(results["a"], ActionWithheld)
     assert "b did not acknowledge" in str(results["a"])
     assert isinstance(results["b"], ReplyTimeout)
-    assert not any(packet.code == Instruction.ACTION and packet.id == 0xFE for packet in bench.said)
+    assert not any(packet.code == Instruction.ACTION and packet.id == 0xFE for packet in bench.sent)
     assert bench.register(1, "async_write_flag") == 0, "disarmed"
     assert (bench.register(1, "goal_position"), bench.register(2, "goal_position")) == goals
 
 
-def test_one_that_took_it_and_was_not_heard_holds_back_the_next_action() -> None:
+def test_a_lost_acknowledgement_withholds_the_next_action() -> None:
     bench = Bench({**TWO, "c": {"id": 3, "model": "sts"}})
     bench.enable()
     goal = bench.register(3, "goal_position")
-    bench.mute = lambda packet: packet.id == 3
+    bench.is_unanswered = lambda packet: packet.id == 3
     bench.move({"a": 10, "c": 10}, confirm=True)
     assert bench.register(3, "async_write_flag") == 1, "it is armed, and nobody knows"
     results = bench.move({"a": 5, "b": 5}, confirm=True)
     assert all(isinstance(result, ActionWithheld) for result in results.values())
     assert "c may hold an older REG WRITE" in str(results["a"])
     assert bench.register(3, "goal_position") == goal
-    bench.mute = lambda packet: False
+    bench.is_unanswered = lambda packet: False
     assert bench.move({"a": 5, "b": 5}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}, (
         "it answers, and is disarmed first"
     )
     assert bench.register(3, "goal_position") == goal
 
 
-def test_one_whose_flag_reads_0_is_believed() -> None:
+def test_a_flag_of_0_permits_the_next_action() -> None:
     bench = Bench({**TWO, "c": {"id": 3, "model": "sts"}})
     bench.enable()
-    bench.deaf = lambda packet: packet.id == 3
+    bench.is_lost = lambda packet: packet.id == 3
     bench.move({"a": 10, "c": 10}, confirm=True)
-    bench.deaf = lambda packet: False
-    bench.said.clear()
+    bench.is_lost = lambda packet: False
+    bench.sent.clear()
     assert bench.move({"a": 5, "b": 5}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
-    assert any(packet.id == 3 and packet.params == bytes((FLAG, 1)) for packet in bench.said)
+    assert any(packet.id == 3 and packet.params == bytes((FLAG, 1)) for packet in bench.sent)
 
 
 def test_on_partial_go_moves_those_that_are_armed() -> None:
     bench = Bench(on_partial="go")
     bench.enable()
-    bench.deaf = lambda packet: packet.id == 2
+    bench.is_lost = lambda packet: packet.id == 2
     results = bench.move({"a": 10, "b": 10}, confirm=True)
     assert results["a"] is Outcome.ACKED
     assert isinstance(results["b"], ReplyTimeout)
@@ -156,7 +156,7 @@ def test_on_partial_go_moves_those_that_are_armed() -> None:
 def test_nobody_acknowledges() -> None:
     bench = Bench(on_partial="go")
     bench.enable()
-    bench.deaf = lambda packet: True
+    bench.is_lost = lambda packet: True
     results = bench.move({"a": 10, "b": 10}, confirm=True)
     assert all(isinstance(result, ReplyTimeout) for result in results.values())
     assert "ACTION" not in bench.instructions()
@@ -165,10 +165,10 @@ def test_nobody_acknowledges() -> None:
 def test_a_servo_that_cannot_be_disarmed_stays_suspect() -> None:
     bench = Bench()
     bench.enable()
-    bench.deaf = lambda packet: packet.id == 2 or (packet.code == Instruction.REG_WRITE and packet.params[0] != 42)
+    bench.is_lost = lambda packet: packet.id == 2 or (packet.code == Instruction.REG_WRITE and packet.params[0] != 42)
     bench.move({"a": 10, "b": 10}, confirm=True)
     assert bench.register(1, "async_write_flag") == 1
-    bench.deaf = lambda packet: False
+    bench.is_lost = lambda packet: False
     results = bench.move({"b": 1, "a": Goal("position", 1, acceleration=900)}, confirm=True)
     assert results == {"b": Outcome.ACKED, "a": Outcome.ACKED}, "overwritten"
 
@@ -189,7 +189,7 @@ def test_without_acknowledgements_the_flag_confirms() -> None:
     assert bench.move({"a": 10, "b": 10}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
     assert bench.instructions() == ["REG_WRITE", "READ", "REG_WRITE", "READ", "ACTION"]
     assert bench.move({"a": 3}, confirm=True) == {"a": Outcome.ACKED}
-    bench.deaf = lambda packet: packet.id == 2 and packet.code == Instruction.REG_WRITE
+    bench.is_lost = lambda packet: packet.id == 2 and packet.code == Instruction.REG_WRITE
     results = bench.move({"a": 5, "b": 5}, confirm=True)
     assert "its flag reads 0" in str(results["b"])
     assert isinstance(results["a"], ActionWithheld)

@@ -1,4 +1,4 @@
-"""Who a servo says it is, and what of it does not fit the config. Nothing is written."""
+"""Who a servo reports to be, and what does not fit the config. Nothing is written."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from tests.protocols.sms.bench import Bench
 
 
 def identity_of(bench: Bench, servo: str = "a") -> Identity:
-    found = bench.run(bench.driver.identify(servo))
-    assert {packet.code for packet in bench.said} == {Instruction.READ}
-    return found
+    identity = bench.run(bench.driver.identify(servo))
+    assert {packet.code for packet in bench.sent} == {Instruction.READ}
+    return identity
 
 
 @pytest.mark.parametrize(("model", "product"), [("sms", "SM"), ("sms_cl", "SM"), ("sts", "STS3215"), ("scs", "SCS15")])
-def test_each_family_is_known_by_its_numbers(model: str, product: str) -> None:
-    found = identity_of(Bench({"a": {"id": 1, "model": model}}))
-    assert found.model == model
-    assert found.product is not None
-    assert found.product.startswith(product)
-    assert (found.firmware, found.mode, found.energised, found.notes) == ("3.10", "position", False, ())
+def test_each_family_is_identified_by_its_numbers(model: str, product: str) -> None:
+    identity = identity_of(Bench({"a": {"id": 1, "model": model}}))
+    assert identity.model == model
+    assert identity.product is not None
+    assert identity.product.startswith(product)
+    assert (identity.firmware, identity.mode, identity.energised, identity.notes) == ("3.10", "position", False, ())
 
 
-def test_who_is_there_without_a_config() -> None:
+def test_an_unconfigured_servo_can_be_inspected() -> None:
     bench = Bench()
-    found = bench.run(bench.driver.inspect(2))
-    assert (found.model, found.product, found.firmware) == ("sts", "STS3215", "3.10")
+    identity = bench.run(bench.driver.inspect(2))
+    assert (identity.model, identity.product, identity.firmware) == ("sts", "STS3215", "3.10")
 
 
-def test_a_number_nobody_knows() -> None:
+def test_an_unknown_model_number() -> None:
     bench = Bench()
     bench.devices[1].memory.data[3:5] = b"\x63\x63"
-    found = identity_of(bench)
-    assert (found.model, found.product) == (None, f"model number {0x6363}")
+    identity = identity_of(bench)
+    assert (identity.model, identity.product) == (None, f"model number {0x6363}")
 
 
 def set_register(bench: Bench, name: str, raw: int) -> None:
@@ -45,7 +45,7 @@ def set_register(bench: Bench, name: str, raw: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "registers", "told"),
+    ("keys", "registers", "message"),
     [
         ({"model": "sms"}, {}, ""),
         ({}, {"response_status_level": 0}, "its response level is 0, so it answers no write"),
@@ -63,13 +63,13 @@ def set_register(bench: Bench, name: str, raw: int) -> None:
         ({"limits": [-90, 90]}, {"min_angle_limit": 0, "max_angle_limit": 0}, ""),
     ],
 )
-def test_notes(keys: dict[str, Any], registers: dict[str, int], told: str) -> None:
+def test_notes(keys: dict[str, Any], registers: dict[str, int], message: str) -> None:
     bench = Bench({"a": {"id": 1, "model": "sts", **keys}})
     for name, raw in registers.items():
         set_register(bench, name, raw)
     notes = "; ".join(identity_of(bench).notes)
-    assert told in notes
-    assert bool(notes) is bool(told)
+    assert message in notes
+    assert bool(notes) is bool(message)
 
 
 def test_another_model_than_the_config_says() -> None:
@@ -78,7 +78,7 @@ def test_another_model_than_the_config_says() -> None:
     assert "the config says sms: check the model" in identity_of(bench).notes[0]
 
 
-def test_acknowledgements_that_nobody_expects() -> None:
+def test_unexpected_acknowledgements_are_noted() -> None:
     bench = Bench(status_return="read_only")
     set_register(bench, "response_status_level", 1)
     assert "it answers writes (response level 1)" in identity_of(bench).notes[0]
@@ -90,8 +90,8 @@ def test_mode_torque_and_limits() -> None:
     set_register(bench, "torque_enable", 1)
     set_register(bench, "min_angle_limit", 1024)
     set_register(bench, "max_angle_limit", 3072)
-    found = identity_of(bench)
-    assert (found.mode, found.energised, found.limits) == ("velocity", True, (-90.0, 90.0))
+    identity = identity_of(bench)
+    assert (identity.mode, identity.energised, identity.limits) == ("velocity", True, (-90.0, 90.0))
 
 
 def test_an_scs_is_a_wheel_without_limits() -> None:
@@ -99,5 +99,5 @@ def test_an_scs_is_a_wheel_without_limits() -> None:
     assert identity_of(bench).mode == "position"
     set_register(bench, "min_angle_limit", 0)
     set_register(bench, "max_angle_limit", 0)
-    found = identity_of(bench)
-    assert (found.mode, found.limits) == ("velocity", None)
+    identity = identity_of(bench)
+    assert (identity.mode, identity.limits) == ("velocity", None)

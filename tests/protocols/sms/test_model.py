@@ -1,4 +1,4 @@
-"""What an SMS model says beyond its register map, and what makes it no model."""
+"""The parts of an SMS model beyond its register map, and which files are not a model."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_keys(**keys: Any) -> SmsModel:
         ("sms_cl", {"position": (-32767, 32767), "speed": (-32767, 32767), "acceleration": (0, 25_400), "torque_limit": (0, 0)}),
     ],
 )
-def test_what_goals_can_carry(family: str, ranges: dict[str, tuple[float, float]]) -> None:
+def test_the_ranges_of_goals(family: str, ranges: dict[str, tuple[float, float]]) -> None:
     assert model_of(family).goal_ranges == ranges
 
 
@@ -49,9 +49,9 @@ def test_the_sentinel_shows_a_restart(family: str) -> None:
     register = model.registers[model.sentinel.name]
     assert model.sentinel.value != model.sentinel.reset
     assert register.memory == "ram"
-    least, greatest = register.raw_range
-    assert least <= model.sentinel.reset <= greatest
-    assert least <= model.sentinel.value <= greatest
+    low, high = register.raw_range
+    assert low <= model.sentinel.reset <= high
+    assert low <= model.sentinel.value <= high
     assert (register.default or 0) == model.sentinel.reset
 
 
@@ -62,7 +62,7 @@ def test_every_family_can_turn_on_as_a_wheel(family: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "told"),
+    ("keys", "message"),
     [
         ({"goal": ["goal_position", "goal_speed", "goal_time"]}, "do not follow one another"),
         ({"goal": ["goal_position", "goal_time"]}, "at least 3 items"),
@@ -80,20 +80,20 @@ def test_every_family_can_turn_on_as_a_wheel(family: str) -> None:
         ({"colour": "red"}, "colour"),
     ],
 )
-def test_what_is_no_model(keys: dict[str, Any], told: str) -> None:
+def test_an_unknown_model_is_refused(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError) as caught:
         with_keys(**keys)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["response_status_level", "min_angle_limit", "max_angle_limit"])
-def test_registers_that_every_servo_is_asked_for(name: str) -> None:
+def test_registers_that_every_model_must_have(name: str) -> None:
     with pytest.raises(ValidationError, match=f"registers: {name} must be there"):
         changed("sts", **{name: None})
 
 
 @pytest.mark.parametrize(
-    ("register", "told"),
+    ("register", "message"),
     [
         ({"address": 256}, "found 1 bytes at address 256; the last address is 255"),
         ({"address": 255, "size": 2}, "found 2 bytes at address 255"),
@@ -110,10 +110,10 @@ def test_registers_that_every_servo_is_asked_for(name: str) -> None:
         ({"address": 200, "default": 256}, "found default 256; it can hold 0 to 255"),
     ],
 )
-def test_what_a_memory_table_can_hold(register: dict[str, Any], told: str) -> None:
-    if not told:
+def test_a_register_must_fit_the_memory_table(register: dict[str, Any], message: str) -> None:
+    if not message:
         assert changed("sts", mine=register).registers["mine"].address == register["address"]
         return
     with pytest.raises(ValidationError) as caught:
         changed("sts", mine=register)
-    assert told in str(caught.value)
+    assert message in str(caught.value)

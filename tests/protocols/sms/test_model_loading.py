@@ -1,4 +1,4 @@
-"""Model files: found by name or beside the config, extended, and every mistake told at its place."""
+"""Model files: found by name or beside the config, extended, and every mistake reported with its line and column."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_names_and_files(tmp_path: Path) -> None:
         FILES.find("mine.yaml", tmp_path)
 
 
-def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
+def test_a_users_model_extends_a_packaged_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("extends: sts\nname: mine\ntitle: Mine\nregisters: {goal_speed: {maximum: 500}}\n")
     model = FILES.read(path)
@@ -30,7 +30,7 @@ def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("extends: none\nname: x\n", ":1:10: extends: found 'none'; there are scs, sms, sms_cl, sts"),
         ("extends: sts\nregisters: {lock: {adress: 5}}\n", "did you mean address?"),
@@ -54,12 +54,12 @@ def test_an_own_model_extends_a_packaged_one(tmp_path: Path) -> None:
         ("name: x\n", "the key title is missing"),
     ],
 )
-def test_mistakes_in_a_model_file(text: str, told: str, tmp_path: Path) -> None:
+def test_mistakes_in_a_model_file(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         FILES.read(path)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def without(path: Path, pattern: str, instead: str) -> None:
@@ -70,16 +70,16 @@ def without(path: Path, pattern: str, instead: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "instead", "told"),
+    ("pattern", "instead", "message"),
     [
         (r"^units: .*$", "units: {}", "units: found 0 here; write 1 or more"),
         (r"^  position: present_position$", "", "state: position must be there"),
         (r"^  response_status_level: .*$", "", "registers: response_status_level must be there"),
     ],
 )
-def test_what_every_model_needs(pattern: str, instead: str, told: str, tmp_path: Path) -> None:
+def test_parts_that_every_model_needs(pattern: str, instead: str, message: str, tmp_path: Path) -> None:
     without(tmp_path / "mine.yaml", pattern, instead)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=message):
         FILES.read(tmp_path / "mine.yaml")
 
 
@@ -93,7 +93,7 @@ def test_what_every_model_needs(pattern: str, instead: str, told: str, tmp_path:
         "lock: {minimum: 1}",
     ],
 )
-def test_what_a_register_can_just_hold(change: str, tmp_path: Path) -> None:
+def test_values_at_the_edge_of_a_register(change: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"extends: sts\nregisters: {{{change}}}\n")
     assert FILES.read(tmp_path / "mine.yaml").registers["lock"]
 

@@ -1,4 +1,4 @@
-"""The packaged model files hold what the vendor's memory tables say."""
+"""The packaged model files match the memory tables of the vendor."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ CASES = [(model, name, fact) for model, facts in FACTS.items() for name, fact in
 
 
 @pytest.mark.parametrize(("model", "name", "fact"), CASES, ids=[f"{model}-{name}" for model, name, _ in CASES])
-def test_registers_stand_where_the_tables_say(model: str, name: str, fact: Fact) -> None:
+def test_registers_have_the_addresses_of_the_tables(model: str, name: str, fact: Fact) -> None:
     register = packaged_models()[model].registers[name]
     assert (register.address, register.size, register.sign_bit, register.memory) == fact
 
 
-def words(*addresses: int) -> dict[int, int]:
+def pairs(*addresses: int) -> dict[int, int]:
     return dict.fromkeys(addresses, 2)
 
 
@@ -75,16 +75,16 @@ TABLES: dict[str, dict[int, int]] = {
     "sms": singles(
         range(9), range(13, 16), range(18, 28), range(30, 31), range(33, 42), range(55, 56), range(62, 67), range(80, 87)
     )
-    | words(9, 11, 16, 28, 31, 42, 44, 46, 48, 56, 58, 60, 67, 69),
+    | pairs(9, 11, 16, 28, 31, 42, 44, 46, 48, 56, 58, 60, 67, 69),
     "sms_cl": singles(range(9), range(13, 16), range(18, 28), range(35, 36), range(40, 42), range(48, 49), range(62, 67))
-    | words(9, 11, 16, 33, 36, 42, 44, 46, 56, 58, 60, 67, 69),
+    | pairs(9, 11, 16, 33, 36, 42, 44, 46, 56, 58, 60, 67, 69),
     "scs": singles(
         range(7), range(8, 9), range(13, 16), range(18, 23), range(26, 28), range(37, 41), range(48, 49), range(62, 67)
     )
-    | words(9, 11, 16, 24, 42, 44, 46, 56, 58, 60, 69),
+    | pairs(9, 11, 16, 24, 42, 44, 46, 56, 58, 60, 69),
 }
 TABLES["sts"] = TABLES["sms"]
-"""Every address of the memory tables (feetech.md, sections 2 and 3) and its bytes."""
+"""Every address of the memory tables  and its bytes."""
 READ_ONLY = {*range(5), *range(56, 71), *range(80, 87)}
 
 
@@ -95,7 +95,7 @@ def test_the_whole_memory_table_is_there(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", TABLES)
-def test_what_can_only_be_read(model: str) -> None:
+def test_registers_that_can_only_be_read(model: str) -> None:
     for register in packaged_models()[model].registers.values():
         assert register.access == ("r" if register.address in READ_ONLY else "rw"), register.name
 
@@ -111,10 +111,10 @@ REGISTERS = [(model.byte_order, register) for model in packaged_models().values(
 
 @pytest.mark.parametrize(("order", "register"), REGISTERS, ids=lambda value: getattr(value, "name", value))
 def test_every_register_holds_its_edges(order: Literal["little", "big"], register: Register) -> None:
-    least, greatest = register.raw_range
-    for raw in {least, greatest, max(least, 0)}:
+    low, high = register.raw_range
+    for raw in {low, high, max(low, 0)}:
         assert register.decode(register.encode(raw, order), order) == raw
-    for raw in (least - 1, greatest + 1):
+    for raw in (low - 1, high + 1):
         with pytest.raises(LimitError, match=f"{register.name}: raw value {raw} is outside"):
             register.encode(raw, order)
 
@@ -155,7 +155,7 @@ PHYSICAL = [
 
 
 @pytest.mark.parametrize(("model", "name", "span"), SPANS, ids=str)
-def test_what_may_be_written(model: str, name: str, span: tuple[int, int]) -> None:
+def test_the_range_of_a_write(model: str, name: str, span: tuple[int, int]) -> None:
     assert packaged_models()[model].registers[name].raw_range == span
 
 
@@ -210,12 +210,12 @@ def test_names_of_health_bits(model: str, status: int, names: tuple[str, ...]) -
         ("scs", "big", 512, False, {"min_angle_limit": 0, "max_angle_limit": 0}),
     ],
 )
-def test_what_differs_between_the_families(model: str, order: str, middle: int, sync_read: bool, wheel: dict[str, int]) -> None:
-    found = packaged_models()[model]
-    assert (found.byte_order, found.zero, found.sync_read) == (order, middle, sync_read)
-    assert found.wheel is not None
-    assert found.wheel.registers == wheel
-    assert found.default_speed == 1000
+def test_differences_between_the_families(model: str, order: str, middle: int, sync_read: bool, wheel: dict[str, int]) -> None:
+    loaded = packaged_models()[model]
+    assert (loaded.byte_order, loaded.zero, loaded.sync_read) == (order, middle, sync_read)
+    assert loaded.wheel is not None
+    assert loaded.wheel.registers == wheel
+    assert loaded.default_speed == 1000
 
 
 def test_all_four_are_packaged() -> None:

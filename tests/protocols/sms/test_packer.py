@@ -28,11 +28,11 @@ def is_reused(bench: Bench, goal: ServoGoal) -> bool:
     """Plans and sends the goal; whether its check had packed these bytes, and not merely equal ones."""
     assert isinstance(goal.packed, PackedGoal)
     reused = goal.packed.is_for(goal)
-    bench.said.clear()
+    bench.sent.clear()
     (turn,) = bench.driver.plan_goals([goal], together=False, confirm=False)
     bench.run(turn.plan)
     fresh = bench.driver.check_goal(goal)
-    assert bench.said[0].params[1:] == goal.packed.data if reused else fresh.data
+    assert bench.sent[0].params[1:] == goal.packed.data if reused else fresh.data
     return reused
 
 
@@ -67,7 +67,7 @@ def test_a_change_packs_the_goal_again(change: Callable[[Bench, ServoGoal], Serv
     changed_goal = change(bench, goal)
     expected = bench.driver.check_goal(replace(changed_goal, packed=None)).data
     assert not is_reused(bench, changed_goal)
-    assert bench.said[0].params[1:] == expected
+    assert bench.sent[0].params[1:] == expected
 
 
 def test_an_equal_report_does_not_count_as_a_change() -> None:
@@ -87,7 +87,7 @@ def test_a_preview_has_the_frames_of_goals_and_changes_nothing() -> None:
     assert [(servo.held, servo.fit) for servo in servos] == before
     bench.enable()
     bench.move(dict.fromkeys(bench.driver.nodes, 1.0))
-    assert frames == [packet.frame for packet in bench.said]
+    assert frames == [packet.frame for packet in bench.sent]
     assert bench.driver.preview_goals([]) == []
 
 

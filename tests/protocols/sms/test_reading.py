@@ -75,7 +75,7 @@ def test_sts_are_polled_by_one_sync_read_and_sms_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["feedback", "health"])
-def test_a_poll_asks_for_those_that_are_there(name: str) -> None:
+def test_a_poll_reads_the_reachable_servos(name: str) -> None:
     bench = Bench()
     (poll,) = bench.driver.polls({name: 10})
     both, one, none = (poll.request(nodes) for nodes in ([1, 2], [2], []))
@@ -86,7 +86,7 @@ def test_a_poll_asks_for_those_that_are_there(name: str) -> None:
     assert set(bench.ask(one)) == {"b"}
 
 
-def test_a_sync_read_is_split_where_its_answers_would_hold_the_line_too_long() -> None:
+def test_a_sync_read_with_long_replies_is_split() -> None:
     servos = {f"s{number}": {"id": number, "model": "sts"} for number in range(1, 13)}
     assert [len(poll.nodes) for poll in Bench(servos).driver.polls({"feedback": 50})] == [12]
     assert [len(poll.nodes) for poll in Bench(servos, baudrate=115_200).driver.polls({"feedback": 50})] == [6, 6]
@@ -107,7 +107,7 @@ def test_without_acknowledgement_it_is_read_back() -> None:
     bench = Bench(status_return="read_only")
     assert bench.run(bench.driver.write_register("a", "torque_limit", 60)) == 60
     assert bench.instructions() == ["WRITE", "READ"]
-    bench.deaf = lambda packet: packet.code == Instruction.WRITE
+    bench.is_lost = lambda packet: packet.code == Instruction.WRITE
     with pytest.raises(DeviceError, match="reads 600 after 500 was written"):
         bench.run(bench.driver.write_register("a", "torque_limit", 50))
 
@@ -115,7 +115,7 @@ def test_without_acknowledgement_it_is_read_back() -> None:
 def test_eeprom_is_unlocked_written_locked_and_read_back() -> None:
     bench = Bench()
     assert bench.run(bench.driver.write_register("a", "return_delay", 100, raw=True, persist=True)) == 100
-    assert [(packet.code, *packet.params) for packet in bench.said] == [
+    assert [(packet.code, *packet.params) for packet in bench.sent] == [
         (Instruction.READ, 40, 1),
         (Instruction.WRITE, LOCK, 0),
         (Instruction.WRITE, DELAY, 100),
@@ -129,15 +129,15 @@ def test_eeprom_is_unlocked_written_locked_and_read_back() -> None:
 
 def test_a_failed_eeprom_write_is_locked_again() -> None:
     bench = Bench()
-    bench.deaf = lambda packet: packet.code == Instruction.WRITE and packet.params[0] == DELAY
+    bench.is_lost = lambda packet: packet.code == Instruction.WRITE and packet.params[0] == DELAY
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.write_register("a", "return_delay", 100, raw=True, persist=True))
-    assert bench.said[-1].params == bytes((LOCK, 1))
+    assert bench.sent[-1].params == bytes((LOCK, 1))
     assert bench.register(1, "lock") == 1
 
 
 @pytest.mark.parametrize(
-    ("register", "value", "keys", "error", "told"),
+    ("register", "value", "keys", "error", "message"),
     [
         ("goal_position", 1, {}, NotSupported, "use move"),
         ("goal_speed", 1, {}, NotSupported, "use move"),
@@ -158,21 +158,23 @@ def test_a_failed_eeprom_write_is_locked_again() -> None:
         ("nothing", 0, {}, UnknownName, "has no register"),
     ],
 )
-def test_what_is_not_written(register: str, value: Any, keys: dict[str, bool], error: type[Exception], told: str) -> None:
+def test_registers_that_are_not_written_by_hand(
+    register: str, value: Any, keys: dict[str, bool], error: type[Exception], message: str
+) -> None:
     bench = Bench()
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         bench.driver.write_register("a", register, value, **keys)
-    assert bench.said == []
+    assert bench.sent == []
 
 
-def test_an_acceleration_written_by_hand_is_known() -> None:
+def test_an_acceleration_written_by_hand_is_replaced() -> None:
     bench = Bench()
     bench.enable()
     bench.run(bench.driver.write_register("a", "acceleration", 1000))
     assert bench.register(1, "acceleration") == 114
-    bench.said.clear()
+    bench.sent.clear()
     bench.move({"a": 5})
-    assert bench.said[0].params[0] == 41, "the goal brings its own again"
+    assert bench.sent[0].params[0] == 41, "the goal brings its own again"
 
 
 @pytest.mark.parametrize(("register", "value", "raw"), [("min_angle_limit", -90, 1024), ("max_angle_limit", 90, 3072)])

@@ -67,7 +67,7 @@ def test_how_many_answer(request_: Request[Any], replies: int, nodes: tuple[int,
     ],
     ids=repr,
 )
-def test_what_may_be_said_again(request_: Request[Any], repeatable: bool) -> None:
+def test_which_requests_may_be_repeated(request_: Request[Any], repeatable: bool) -> None:
     assert request_.idempotent is repeatable
 
 
@@ -76,7 +76,7 @@ def test_what_may_be_said_again(request_: Request[Any], repeatable: bool) -> Non
     [Ping(1), PingById(1), Read(1, 56, 2, bytes), Write(1, 42, b"\0\0"), RegWrite(1, 42, b"\0\0"), Action(1)],
     ids=repr,
 )
-def test_another_servo_or_another_length_is_no_answer(request_: Request[Any]) -> None:
+def test_another_id_or_length_does_not_answer(request_: Request[Any]) -> None:
     size = request_.reply_size - 6
     assert request_.answers(reply(1, bytes(size), status=0x20))
     assert not request_.answers(reply(2, bytes(size)))
@@ -91,7 +91,7 @@ def test_ping_gives_the_status() -> None:
     assert Ping(BROADCAST_ID).answers(reply(77))
 
 
-def test_an_acknowledgement_gives_the_status_and_silence_nothing() -> None:
+def test_an_acknowledgement_gives_the_status() -> None:
     assert Write(1, 42, b"\0").parse([reply(1, status=4)]) == 4
     assert Write(1, 42, b"\0", answered=False).parse(()) is None
 
@@ -110,7 +110,7 @@ def test_a_read_of_two_bytes_is_asked_again_with_three(address: int, size: int) 
     assert plain.parse([reply(1, memory[first : first + count])]) == memory[address : address + size]
 
 
-def test_ping_is_asked_again_in_a_form_whose_echo_cannot_answer() -> None:
+def test_ping_has_a_form_whose_echo_cannot_answer() -> None:
     assert Ping(1).answers(packet_of(Ping(1).frame))
     assert not Ping(1).plain().answers(packet_of(Ping(1).plain().frame))
     assert Read(1, 56, 3, bytes).plain() is None
@@ -142,7 +142,7 @@ def test_sync_read() -> None:
     assert question.parse([reply(3, b"\x03\0"), reply(1, b"\x01\0")]) == {3: b"\x03\0", 1: b"\x01\0"}
 
 
-def test_sync_write_says_the_same_span_for_all() -> None:
+def test_sync_write_has_one_span_for_all() -> None:
     assert len(SyncWrite(42, {1: bytes(6), 2: bytes(6)}).frame) == sync_write_size(6, 2)
     for data in ({1: b"\0", 2: b"\0\0"}, {1: b""}):
         with pytest.raises(ValueError, match="same number of bytes"):
@@ -150,7 +150,7 @@ def test_sync_write_says_the_same_span_for_all() -> None:
 
 
 @pytest.mark.parametrize("kind", [Write, RegWrite])
-def test_a_write_without_data_says_nothing(kind: type[Write] | type[RegWrite]) -> None:
+def test_a_write_without_data_is_refused(kind: type[Write] | type[RegWrite]) -> None:
     with pytest.raises(ValueError, match="at least one byte"):
         kind(1, 42, b"")
 

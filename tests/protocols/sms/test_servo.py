@@ -73,7 +73,7 @@ def test_the_middle_is_position_0(family: str) -> None:
 
 @pytest.mark.parametrize("name", ["goal_position", "goal_speed", "acceleration", "torque_limit"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), True, "1", None, 10**400], ids=lambda value: str(value)[:5])
-def test_what_is_no_number(name: str, value: Any) -> None:
+def test_values_that_are_not_numbers_are_refused(name: str, value: Any) -> None:
     servo = servo_of()
     with pytest.raises(LimitError, match=f"register {name}: .* is not a finite number"):
         servo.to_raw(servo.model.registers[name], value)
@@ -114,7 +114,7 @@ def test_a_block_becomes_fields_of_the_state() -> None:
     assert feedback["moving"] is True
 
 
-def test_an_scs_says_the_high_byte_first() -> None:
+def test_an_scs_sends_the_high_byte_first() -> None:
     update = servo_of("scs").decode_feedback(bytes.fromhex("02 01 80 0a 04 64 4a 1e 00 00 00"))
     assert (update["position"], update["speed"]) == pytest.approx((0.21484375, -10 * 0.21484375))
     assert (update["load"], update["moving"]) == (-10.0, False)
@@ -156,7 +156,7 @@ def test_an_acceleration_below_one_count_is_one() -> None:
         (Goal("position", 0, effort=100.06), False),
     ],
 )
-def test_words_at_the_edge_of_their_registers(goal: Goal, right: bool) -> None:
+def test_goals_at_the_edge_of_their_registers(goal: Goal, right: bool) -> None:
     if right:
         assert span_of(servo_of(), goal)
     else:
@@ -165,7 +165,7 @@ def test_words_at_the_edge_of_their_registers(goal: Goal, right: bool) -> None:
 
 
 @pytest.mark.parametrize(("duration", "right"), [(9.9994, True), (9.9996, False), (0.0001, True)])
-def test_the_time_word_of_an_scs(duration: float, right: bool) -> None:
+def test_the_time_register_of_an_scs(duration: float, right: bool) -> None:
     goal = Goal("position", 0, duration=duration)
     if right:
         time = span_of(servo_of("scs"), goal).split()[3:5]
@@ -180,8 +180,8 @@ def test_the_time_word_of_an_scs(duration: float, right: bool) -> None:
     [(90, 1.0, 0.0, 1024), (-90, 1.0, 0.0, 1024), (90, 1.0, 90.0, 1000), (90, 1.0, 89.9999, 1), (90, 2.0, -90.0, 1024)],
 )
 def test_a_duration_becomes_a_speed(value: float, duration: float, start: float, speed: int) -> None:
-    words = span_of(servo_of(), Goal("position", value, duration=duration), start).split()
-    assert int(words[6] + words[5], 16) == speed
+    data = span_of(servo_of(), Goal("position", value, duration=duration), start).split()
+    assert int(data[6] + data[5], 16) == speed
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -215,12 +215,12 @@ def test_a_goal_of_the_other_kind(mode: Any, kind: Any) -> None:
         ("scs", Goal("position", 0, acceleration=5), "an acceleration"),
     ],
 )
-def test_what_a_model_has_no_register_for(family: str, goal: Goal, what: str) -> None:
+def test_a_setting_without_a_register_is_refused(family: str, goal: Goal, what: str) -> None:
     with pytest.raises(NotSupported, match=f"model {family} has no register for {what}: take it out"):
         span_of(servo_of(family), goal)
 
 
-def test_only_what_the_servo_does_not_hold_is_written_beside_a_goal() -> None:
+def test_only_missing_settings_travel_with_a_goal() -> None:
     servo = servo_of()
     packer = GoalPacker(servo)
     assert packer.missing_settings(Goal("position", 0)) == {}

@@ -10,7 +10,7 @@ from servobus.protocols.sms.simulated.joint import AMBIENT, RISE, THERMAL_S, Joi
 
 
 def joint_at(position: float, target: float, rate: float = 100.0, **options: bool) -> Joint:
-    """One that is told the time: 0."""
+    """A joint that knows the time: 0."""
     joint = Joint(4096, 1000.0, position, target, rate, driven=True, **options)
     joint.advance(0.0)
     return joint
@@ -25,8 +25,8 @@ def test_it_goes_to_its_target_and_no_further(target: float, at: float) -> None:
     assert joint.velocity == (0 if at == target else math.copysign(100, target - 1000))
 
 
-def test_many_small_steps_end_where_one_great_step_does() -> None:
-    """It is told the time as often as somebody asks."""
+def test_many_small_steps_equal_one_long_step() -> None:
+    """The joint may be advanced any number of times."""
     often, once = joint_at(0, 3000), joint_at(0, 3000)
     for tick in range(1, 101):
         often.advance(tick / 10)
@@ -35,7 +35,7 @@ def test_many_small_steps_end_where_one_great_step_does() -> None:
     assert often.temperature == pytest.approx(once.temperature)
 
 
-def test_the_first_time_is_only_a_beginning() -> None:
+def test_the_first_time_moves_nothing() -> None:
     """However late it is."""
     joint = Joint(4096, 1000.0, 0, 500, 100.0, driven=True)
     joint.advance(1e9)
@@ -78,7 +78,7 @@ def test_turns_are_counted_where_it_does_not_wrap() -> None:
     assert joint.position == -9000
 
 
-def test_load_is_the_share_of_the_greatest_speed() -> None:
+def test_load_is_the_share_of_the_maximum_speed() -> None:
     """Signed; all of it where something holds the joint, which then does not move."""
     joint = joint_at(0, -500, 250.0, wraps=False)
     assert joint.load == -0.25
@@ -100,8 +100,8 @@ def test_it_warms_up_while_it_works_and_cools_down_after() -> None:
     assert joint.temperature == pytest.approx(AMBIENT + (warm - AMBIENT) * math.exp(-1))
 
 
-def test_a_way_that_ends_half_way_through_warms_for_half_the_time() -> None:
-    """Arrival is found within the step."""
+def test_a_motion_of_half_the_time_warms_for_half_the_time() -> None:
+    """The joint stops at the target within the step."""
     whole, halves = joint_at(0, 500, 1000.0), joint_at(0, 500, 1000.0)
     whole.advance(1.0)
     halves.advance(0.5)

@@ -36,7 +36,7 @@ def test_motion_goes_both_ways(master: Master) -> None:
     assert master.after(AT_THE_GOAL).read("present_position") == middle - 100
 
 
-def test_speed_0_is_the_greatest_speed() -> None:
+def test_speed_0_is_the_maximum_speed() -> None:
     """And no speed is greater."""
     for speed in (0, 30_000):
         master = master_of("sts", position=1000)
@@ -45,7 +45,7 @@ def test_speed_0_is_the_greatest_speed() -> None:
         assert master.read("present_position") == 2000
 
 
-def test_the_time_word_rules_where_it_is_milliseconds() -> None:
+def test_the_time_register_counts_where_it_is_milliseconds() -> None:
     """SCS: used when the speed is 0; STS does not look at it."""
     master = master_of("scs", position=500)
     master.go(600, time=2000)
@@ -58,7 +58,7 @@ def test_the_time_word_rules_where_it_is_milliseconds() -> None:
 
 
 def test_limits_stop_the_joint_and_leave_the_goal_register(master: Master) -> None:
-    """Feetech.md, section 9: clamped without a word."""
+    """The servo clamps the goal and reports no error."""
     master.write("min_angle_limit", 300)
     master.write("max_angle_limit", 700)
     for goal, end in ((900, 700), (100, 300)):
@@ -105,7 +105,7 @@ def test_a_wheel_runs_at_signed_speed() -> None:
 
 
 def test_scs_is_a_wheel_when_both_limits_are_0() -> None:
-    """The mode of a model is what its file says."""
+    """The model file decides which mode is which."""
     master = master_of("scs", position=500)
     master.write("min_angle_limit", 0)
     master.write("max_angle_limit", 0)
@@ -135,7 +135,7 @@ def test_other_modes_rest() -> None:
     assert master.after(10).read("present_position") == 1000
 
 
-def test_the_offset_shifts_what_is_reported() -> None:
+def test_the_offset_shifts_the_reported_position() -> None:
     """present = (raw - offset) mod steps per turn."""
     master = master_of("sts", position=100)
     master.write("position_offset", 200)
@@ -147,10 +147,10 @@ def test_the_offset_shifts_what_is_reported() -> None:
 
 
 @pytest.mark.parametrize("position", [0, 1, 100, 2048, 4095])
-def test_torque_128_makes_this_the_middle(position: int) -> None:
+def test_torque_128_makes_the_position_the_middle(position: int) -> None:
     """It is kept though the lock is on; torque stays what it was. Exactly half a turn off no offset can hold."""
     master = master_of("sts", position=position)
-    master.say(Instruction.WRITE, b"\x28\x80")
+    master.send(Instruction.WRITE, b"\x28\x80")
     assert master.read(master.model.torque) == 0
     master.device.reboot(0.0)
     assert master.after(10).read("present_position") == (2047 if position == 0 else 2048)
