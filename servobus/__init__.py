@@ -1,6 +1,7 @@
 """servobus: one asyncio service that owns a robot's serial lines and gives many callers safe, awaitable access to many servos.
 
-Every public name is loaded when it is first used: `import servobus` costs nothing, and a client of a daemon needs no engine.
+`open` makes a rig whose ports this process owns, `connect` one of a running daemon, `blocking` both for scripts without
+asyncio. Everything is loaded when it is first used.
 """
 
 from importlib import import_module
@@ -34,11 +35,23 @@ if TYPE_CHECKING:
         UnknownName,
     )
     from servobus.remote.rig import RemoteRig, connect
-    from servobus.rig.events import Event
-    from servobus.rig.interface import Found, Reload, Rig, Servo, Snapshot
+    from servobus.rig.events import Event, EventStream
+    from servobus.rig.interface import Rig, Servo
     from servobus.rig.local import LocalRig
-    from servobus.rig.opening import open_rig as open
-    from servobus.values import Change, Goal, Identity, Outcome, State, StopReport
+    from servobus.rig.local import open_rig as open
+    from servobus.values import (
+        Change,
+        EventName,
+        Goal,
+        Health,
+        Identity,
+        Outcome,
+        Reload,
+        ScanHit,
+        Snapshot,
+        State,
+        StopReport,
+    )
 
     __version__: str
 
@@ -52,9 +65,11 @@ __all__ = [
     "EStopped",
     "EchoMismatch",
     "Event",
-    "Found",
+    "EventName",
+    "EventStream",
     "Goal",
     "GoalExpired",
+    "Health",
     "Identity",
     "InvalidRequest",
     "LeaseHeld",
@@ -73,6 +88,7 @@ __all__ = [
     "RemoteRig",
     "ReplyTimeout",
     "Rig",
+    "ScanHit",
     "Servo",
     "ServobusError",
     "SettleTimeout",
@@ -85,31 +101,27 @@ __all__ = [
     "connect",
     "open",
 ]
-
 _MODULES = {
-    "Event": "rig.events",
-    "LocalRig": "rig.local",
-    "RemoteRig": "remote.rig",
-    "connect": "remote.rig",
-    "open": "rig.opening",
-    **dict.fromkeys(("Found", "Reload", "Rig", "Servo", "Snapshot"), "rig.interface"),
-    **dict.fromkeys(("Change", "Goal", "Identity", "Outcome", "State", "StopReport"), "values"),
+    "rig.local": {"LocalRig", "open"},
+    "remote.rig": {"RemoteRig", "connect"},
+    "rig.interface": {"Rig", "Servo"},
+    "rig.events": {"Event", "EventStream"},
+    "values": {
+        *("Change", "EventName", "Goal", "Health", "Identity", "Outcome", "Reload", "ScanHit", "Snapshot", "State", "StopReport"),
+    },
 }
-"""Public name -> its module; a name that is missing here is an error's."""
-_OTHER_NAMES = {"open": "open_rig"}
-"""Public name -> its name in that module, where the two differ."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: Any
     if name == "__version__":
-        value = import_module("importlib.metadata").version("servobus")
+        value: Any = import_module("importlib.metadata").version(__name__)
     elif name == "blocking":
         value = import_module("servobus.blocking")
     else:
-        value = getattr(import_module(f"servobus.{_MODULES.get(name, 'errors')}"), _OTHER_NAMES.get(name, name))
+        module = next((module for module, names in _MODULES.items() if name in names), "errors")
+        value = getattr(import_module(f"{__name__}.{module}"), "open_rig" if name == "open" else name)
     globals()[name] = value
     return value
 

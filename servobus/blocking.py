@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Self, Ty
 from servobus.errors import LinkDown
 from servobus.remote import rig as client
 from servobus.rig.events import Event
-from servobus.rig.interface import Rig, Servo, Snapshot
+from servobus.rig.interface import Rig, Servo
+from servobus.values import Snapshot
 
 if TYPE_CHECKING:
     from servobus.config.loader import Config
@@ -247,6 +248,6 @@ connect = _waiting(client.connect)
 
 def open(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
     """A rig whose ports this process owns: `servobus.open`."""
-    from servobus.rig.opening import open_rig  # the engine, which a client does without
+    from servobus.rig.local import open_rig  # the engine, which a client does without
 
     return _waiting(open_rig)(config, buses=buses, degraded=degraded)

@@ -160,6 +160,48 @@ class State:
     """Seconds since `time` when this was made."""
 
 
+Snapshot = dict[str, State]
+"""The last known state of every servo, by full name."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanHit:
+    """A node that answered a scan.
+
+    Attributes:
+        bus: Name of the bus.
+        id: The id that answered.
+        baudrate: The baud rate at which it answered, in bit/s.
+        model: Name of a model file that fits; None: none does.
+        product: What the node calls itself; None: the protocol has no such register.
+        firmware: Its firmware version; None: the protocol has no such register.
+        note: What a person should know.
+    """
+
+    bus: str
+    id: int
+    baudrate: int
+    model: str | None
+    product: str | None
+    firmware: str | None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """What reading the config again changed, as names of buses.
+
+    Attributes:
+        added: Buses that are new.
+        changed: Buses that were left as at exit and opened again; their servos are not enabled.
+        removed: Buses that are gone.
+    """
+
+    added: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class Identity:
     """What a servo says of itself; None where the protocol does not tell."""

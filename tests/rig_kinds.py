@@ -12,8 +12,7 @@ from servobus.config.loader import Config
 from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.remote.rig import connect
 from servobus.rig.interface import Rig
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from tests.daemon_in_process import open_test_door
 from tests.simulated_rigs import devices
 

@@ -10,8 +10,7 @@ from typing import Any, cast
 
 from servobus.config.loader import Config, parse_config
 from servobus.protocols.sms.simulated.device import SmsDevice
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.simulation.link import SimulatedLink, far_end, simulated_line
 from servobus.simulation.pty import SimulatedPty
 

@@ -6,7 +6,7 @@ import pytest
 
 from servobus.config.loader import parse_config
 from servobus.errors import EStopped, LimitError, NotEnabled
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Outcome
 from tests.virtual_time import virtual
 

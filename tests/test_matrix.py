@@ -11,8 +11,7 @@ import pytest
 
 from servobus.config.loader import Config
 from servobus.errors import ServobusError
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.values import Outcome
 from tests.simulated_rigs import config, pty_rig
 from tests.virtual_time import virtual

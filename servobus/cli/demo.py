@@ -17,8 +17,7 @@ from servobus.cli.output import Number, echo_table, emit, logs, run
 from servobus.config.loader import parse_config
 from servobus.errors import ServobusError
 from servobus.rig.interface import Servo
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.values import Outcome
 
 GOAL_HZ = 100.0

@@ -25,8 +25,9 @@ from servobus.cli.output import (
 )
 from servobus.cli.rig_context import Options, opened, servo_options
 from servobus.remote.rig import RemoteRig
-from servobus.rig.interface import Rig, Snapshot
+from servobus.rig.interface import Rig
 from servobus.rig.local import LocalRig
+from servobus.values import Snapshot
 
 MAX_HZ = 50.0
 

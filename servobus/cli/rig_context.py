@@ -21,7 +21,7 @@ from servobus.errors import ConfigError, DeviceError, LinkDown, NotSupported, Po
 from servobus.protocols.registry import PROTOCOLS
 from servobus.remote.rig import RemoteRig, connect
 from servobus.rig.interface import Rig, full_name
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.rig.supervisor import Trace
 from servobus.rpc.socket_path import find_socket
 

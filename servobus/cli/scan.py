@@ -22,7 +22,8 @@ from servobus.config.loader import Config, parse_config
 from servobus.errors import ServobusError, UnknownName
 from servobus.protocols.registry import PROTOCOLS
 from servobus.remote.rig import RemoteRig
-from servobus.rig.interface import Found, Rig
+from servobus.rig.interface import Rig
+from servobus.values import ScanHit
 
 INTERRUPTED, NONE_FOUND = 130, 1
 MIN_RATE, MAX_RATE = 300, 10_000_000
@@ -79,7 +80,7 @@ class Search:
     def __init__(
         self, options: Options, bus: str | None, port: str | None, protocol: str, rates: str | None, ids: str | None
     ) -> None:
-        self.found: list[Found] = []
+        self.found: list[ScanHit] = []
         self._options = options
         self._bus = bus
         self._rates = rates
@@ -102,7 +103,7 @@ class Search:
             rates, ids = _rates(self._rates, entry.baudrates, self._bare), _ids(self._ids, entry.scan_ids)
             with _progress() as told:
 
-                def progress(asked: int, count: int, hit: Found | None) -> None:
+                def progress(asked: int, count: int, hit: ScanHit | None) -> None:
                     if hit is not None:
                         self.found.append(hit)
                     told(asked, count, len(self.found))
@@ -200,7 +201,7 @@ def _ids(text: str | None, known: range) -> list[int]:
     return list(range(low, high + 1))
 
 
-def _tell(options: Options, line: Line, found: list[Found], as_yaml: bool) -> None:
+def _tell(options: Options, line: Line, found: list[ScanHit], as_yaml: bool) -> None:
     if options.as_json:
         emit([dataclasses.asdict(hit) for hit in found])
     elif not found:
@@ -212,7 +213,7 @@ def _tell(options: Options, line: Line, found: list[Found], as_yaml: bool) -> No
         echo_table(None, ("id", "baud rate", "model", "product", "firmware", "note"), rows)
 
 
-def starter(line: Line, found: list[Found]) -> str:
+def starter(line: Line, found: list[ScanHit]) -> str:
     """A config of what was found, that `check` accepts. A line has one rate, and a servo needs a model: what stands against
     that is told in comments."""
     rate = max((hit.baudrate for hit in found), key=lambda rate: sum(hit.baudrate == rate for hit in found))
@@ -234,7 +235,7 @@ def starter(line: Line, found: list[Found]) -> str:
     return f"{HEAD}{notes}{text.getvalue()}"
 
 
-def _why_not(hit: Found, rate: int) -> str:
+def _why_not(hit: ScanHit, rate: int) -> str:
     if hit.baudrate != rate:
         return f"{hit.model or 'unknown model'}: a line has one rate, and most servos here answer at {rate}"
     return f"no model file fits it ({hit.note or hit.product or 'it does not say who it is'}): name one, or write your own"

@@ -1,20 +1,21 @@
-"""One client of the native door: an asyncio protocol.
+"""One client of the daemon: an asyncio protocol.
 
-A call of `stop`, or `renew`, is looked for in whatever has come, and done before anything else. The other lines wait for their
-share of the loop, in turn with those of all other clients. A client that says more than its rate is read more slowly; one that
-does not read what it is told is not told more, and left when that lasts.
+Received lines are searched for a call of `stop` or `renew`, which is done before anything else. The other lines wait for their
+share of the loop, in turn with those of all other clients. A client that sends above its rate is read more slowly. A client that
+does not read gets no more notices, and is disconnected when that lasts.
 """
 
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections import deque
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Coroutine
 from types import CoroutineType
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Protocol, cast
 
-from servobus.config.access import Role
-from servobus.daemon.fairness import TokenBucket
+from servobus.config.access import DoorOptions, Role
+from servobus.daemon.fairness import FairShare, TokenBucket
 from servobus.daemon.jsonrpc import (
     URGENT,
     Call,
@@ -28,43 +29,58 @@ from servobus.daemon.jsonrpc import (
     parse,
     urgent,
 )
-from servobus.daemon.methods import VERBS, require
+from servobus.daemon.methods import HANDLERS, Services, require_role
 from servobus.errors import ServobusError
 from servobus.rig.logs import EventLogger
 from servobus.rpc.methods import Hello
 
-if TYPE_CHECKING:
-    from servobus.daemon.server import NativeDoor
-
 MAX_WAITING = 256 * 1024
-"""Bytes of one client that may wait; then it is not read until they are fewer. Well above what our own client lets wait, so that
-its `stop` is always read."""
+"""Bytes of one client that may wait; above it the client is not read. More than our own client lets wait, so that its `stop` is
+always read."""
 MAX_TASKS = 256
-"""Calls of one client under way at once, above which only the urgent ones begin."""
+"""Calls of one client under way at once; above it only urgent ones begin."""
 MAX_UNREAD = 256 * 1024
-"""Bytes that a client may be behind with its reading."""
-PATIENCE = 10.0
-"""Seconds after which one that reads nothing is left."""
+"""Bytes that a client may be behind with reading."""
+MAX_BLOCKED = 10.0
+"""Seconds after which a client that reads nothing is disconnected."""
 OVERHEAD = 64
-"""Bytes that a line takes besides what it says."""
-LABEL = 64
+"""Bytes that a waiting line takes besides its text."""
+MAX_LABEL = 64
+"""Letters of a client's name."""
 
 log = EventLogger("servobus.daemon")
 
 
 def printable(name: str) -> str:
-    """As others may be shown it."""
-    return "".join(letter if letter.isprintable() else "?" for letter in name[:LABEL])
+    """The name of a client as other clients may see it."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:MAX_LABEL])
 
 
-class Connection(asyncio.Protocol):
-    """`role` and `who` are the listener's to say; on TCP they come with the token."""
+class Door(Protocol):
+    """What a connection needs of the door that it came through."""
 
-    def __init__(self, door: NativeDoor, *, tcp: bool = False) -> None:
-        self.door: NativeDoor = door
+    loop: asyncio.AbstractEventLoop
+    options: DoorOptions
+    services: Services
+    share: FairShare
+
+    def now(self) -> float: ...
+
+    def enter(self, client: ClientConnection, sock: socket.socket, *, tcp: bool) -> ServobusError | None: ...
+
+    def admit(self, client: ClientConnection, token: str | None) -> Role: ...
+
+    def leave(self, client: ClientConnection) -> None: ...
+
+
+class ClientConnection(asyncio.Protocol):
+    """`role` and `who` are set by the door; on TCP the role comes with the token."""
+
+    def __init__(self, door: Door, *, tcp: bool = False) -> None:
+        self.door = door
         self.role = Role.NOBODY
         self.blocked = False
-        """It does not read: nothing more is written than what it waits for."""
+        """The client does not read: only replies to its calls are written."""
         self.who = ""
         self._name = ""
         self._tcp = tcp
@@ -73,21 +89,23 @@ class Connection(asyncio.Protocol):
         self._waiting = 0
         """Bytes that they take."""
         self._tasks: set[asyncio.Task[None]] = set()
-        self._working = False
-        self._resting = False
+        self._scheduled = False
+        """A next line will be handled without further ado."""
+        self._paused = False
+        """The socket is not read."""
         self._closed = False
-        self._over = False
-        """It says nothing more."""
+        self._at_eof = False
+        """The client sends nothing more."""
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport
 
     @property
     def label(self) -> str:
-        """Who holds a lease, for others."""
+        """The holder of a lease, as other clients see it."""
         return f"{self._name} ({self.who})" if self._name else self.who
 
     def greet(self, params: Hello) -> None:
-        """Raises AccessDenied for a token that is not the right one."""
+        """Take its name and token. Raises AccessDenied for a wrong token."""
         if self._tcp and self.role is Role.NOBODY:
             self.role = self.door.admit(self, params.token)
         self._name = printable(params.client)
@@ -115,19 +133,19 @@ class Connection(asyncio.Protocol):
     def pause_writing(self) -> None:
         self.blocked = True
         self._stop_timer()
-        self._timer = self.door.loop.call_later(PATIENCE, self._transport.abort)
+        self._timer = self.door.loop.call_later(MAX_BLOCKED, self._transport.abort)
 
     def resume_writing(self) -> None:
         self.blocked = False
         self._stop_timer()
-        self._work()
+        self._handle_lines()
 
     def eof_received(self) -> bool:
-        """What it asked before it ended is answered first: `nc` ends so."""
-        self._over = True
+        """Answer first what the client asked before it closed its side (`nc` does so)."""
+        self._at_eof = True
         if not (self._lines or self._tasks):
             return False
-        self.door.loop.call_later(PATIENCE, self._transport.close)
+        self.door.loop.call_later(MAX_BLOCKED, self._transport.close)
         return True
 
     def _stop_timer(self) -> None:
@@ -142,53 +160,53 @@ class Connection(asyncio.Protocol):
             self.write(refusal.answer() + b"\n")
             self._transport.close()
             return
-        ahead = set(URGENT)  # of each, one in what came together: a flood of them waits as any other
+        allowed = set(URGENT)  # one of each in what came together goes ahead; a flood of them waits like any other call
         for line in lines:
-            found = urgent(line) & ahead
-            if found:
-                ahead -= found
+            methods = urgent(line) & allowed
+            if methods:
+                allowed -= methods
                 self._do(line)
             elif line.strip():
                 self._lines.append(line)
                 self._waiting += len(line) + OVERHEAD
-        if self._waiting > MAX_WAITING and not self._resting:
-            self._resting = True
+        if self._waiting > MAX_WAITING and not self._paused:
+            self._paused = True
             self._transport.pause_reading()
-        self._work()
+        self._handle_lines()
 
     # Its share of the loop
 
-    def _work(self) -> None:
-        if self._lines and not (self._working or self._closed or self.blocked or len(self._tasks) >= MAX_TASKS):
-            self._working = True
+    def _handle_lines(self) -> None:
+        if self._lines and not (self._scheduled or self._closed or self.blocked or len(self._tasks) >= MAX_TASKS):
+            self._scheduled = True
             more = True
-            while more and self.door.work.at_once():  # goals that came together leave together
-                more = self._turn()
+            while more and self.door.share.at_once():  # goals that came together leave together
+                more = self._next_line()
             if more:
-                self.door.work.add(self._turn)
+                self.door.share.add(self._next_line)
 
-    def _turn(self) -> bool:
-        """One line; whether there is another to be done at once."""
+    def _next_line(self) -> bool:
+        """Handle one line. Returns whether another one may be handled at once."""
         if self._closed or not self._lines:
-            self._working = False
+            self._scheduled = False
             return False
         line = self._lines.popleft()
         self._waiting -= len(line) + OVERHEAD
         self._do(line)
-        if self._resting and self._waiting <= MAX_WAITING // 2 and not self._closed:
-            self._resting = False
+        if self._paused and self._waiting <= MAX_WAITING // 2 and not self._closed:
+            self._paused = False
             self._transport.resume_reading()
         wait = self._bucket.take(self.door.now())
         if wait:
-            self.door.loop.call_later(wait, self._go_on)  # it stays `working`: nothing else begins its next turn
+            self.door.loop.call_later(wait, self._go_on)  # it stays scheduled, so that nothing else handles its next line
             return False
-        self._working = bool(self._lines) and not (self.blocked or len(self._tasks) >= MAX_TASKS)
+        self._scheduled = bool(self._lines) and not (self.blocked or len(self._tasks) >= MAX_TASKS)
         self._leave_if_done()
-        return self._working
+        return self._scheduled
 
     def _go_on(self) -> None:
-        self._working = False
-        self._work()
+        self._scheduled = False
+        self._handle_lines()
 
     def _do(self, line: bytes) -> None:
         try:
@@ -213,41 +231,41 @@ class Connection(asyncio.Protocol):
         if isinstance(result, CoroutineType):
             self._spawn(self._finish(call, result))
         elif call.wants_answer:
-            self.write(self._told(call, result) + b"\n")
+            self.write(self._reply(call, result) + b"\n")
 
     def _begin(self, call: Call) -> Any:
-        """The result, its error, or what to await for them."""
+        """The result, an error, or a coroutine to await for them."""
         try:
-            require(self, call.method, call.params)
-            return VERBS[call.method](self, call.params)
-        except Exception as error:  # noqa: BLE001 - whatever it is, its caller is told
+            require_role(self, call.method, call.params)
+            return HANDLERS[call.method](self.door.services, self, call.params)
+        except Exception as error:  # noqa: BLE001 - whatever it is, it becomes the reply
             return error
 
-    def _told(self, call: Call, result: Any) -> bytes:
+    def _reply(self, call: Call, result: Any) -> bytes:
         if isinstance(result, BaseException):
             if not isinstance(result, (ServobusError, ValueError, TypeError)):
-                log.error("door_mistake", method=call.method, error=repr(result))
+                log.error("internal_error", method=call.method, error=repr(result))
             return failure(call.id, result)
         return answered(call.id, result)
 
     async def _batch(self, calls: list[Call | Refused]) -> None:
-        """One after the other, what is urgent first; the answers leave together, in the order of the calls."""
+        """Do the calls one after the other, urgent ones first. The replies leave together, in the order of the calls."""
         answers: dict[int, bytes] = {}
         for at in sorted(range(len(calls)), key=lambda at: getattr(calls[at], "method", "") not in URGENT):
             call = calls[at]
             if isinstance(call, Refused):
                 answers[at] = call.answer()
                 continue
-            told = await self._ended(self._begin(call))
+            result = await self._ended(self._begin(call))
             if call.wants_answer:
-                answers[at] = self._told(call, told)
+                answers[at] = self._reply(call, result)
         if answers:
             self.write(b"[%b]\n" % b",".join(answers[at] for at in sorted(answers)))
 
     async def _finish(self, call: Call, result: Awaitable[Any]) -> None:
-        told = await self._ended(result)
+        value = await self._ended(result)
         if call.wants_answer:
-            self.write(self._told(call, told) + b"\n")
+            self.write(self._reply(call, value) + b"\n")
 
     @staticmethod
     async def _ended(result: Any) -> Any:
@@ -255,31 +273,31 @@ class Connection(asyncio.Protocol):
             return result
         try:
             return await result
-        except Exception as error:  # noqa: BLE001 - whatever it is, its caller is told
+        except Exception as error:  # noqa: BLE001 - whatever it is, it becomes the reply
             return error
 
-    def _spawn(self, work: Any) -> None:
-        task = self.door.loop.create_task(work)
+    def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = self.door.loop.create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
-        self._work()
+        self._handle_lines()
         self._leave_if_done()
 
     def _leave_if_done(self) -> None:
-        if self._over and not (self._lines or self._tasks or self._closed):
+        if self._at_eof and not (self._lines or self._tasks or self._closed):
             self._transport.close()
 
-    # What it is told
+    # Out
 
     def write(self, data: bytes) -> None:
         if not self._closed:
             self._transport.write(data)
 
     def notify(self, method: str, params: Any) -> None:
-        """Only as far as it reads."""
+        """Send a notice, unless the client does not read."""
         if not self.blocked:
             self.write(notification(method, encode(params)))
 

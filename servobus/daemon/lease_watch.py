@@ -1,4 +1,4 @@
-"""Leases on a rig: whose servos they are, and what becomes of those of a client that is gone."""
+"""The motion leases of a rig in time: when they end, and what becomes of the servos of a client that is lost."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ STOPPING = "the client that moved it is gone, and it is being stopped: wait a mo
 
 
 class LeaseWatch:
-    """One for each door. Times are the loop's."""
+    """One for each daemon. `lease_ms`: how long a lease lasts without a renewal."""
 
-    def __init__(self, rig: LocalRig, ttl: float) -> None:
-        self.leases = Leases(ttl)
+    def __init__(self, rig: LocalRig, lease_ms: int) -> None:
+        self.lease_ms = lease_ms
+        self.leases = Leases(lease_ms / 1000)
         self._rig = rig
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -27,18 +28,22 @@ class LeaseWatch:
         self._labels: dict[Hashable, str] = {}
         self._stopping: set[asyncio.Task[None]] = set()
 
+    def holders(self) -> dict[str, str]:
+        """Servo -> the label of the client that holds it."""
+        return self.leases.holders()
+
     def check(self, client: Hashable, servos: Iterable[str]) -> None:
-        """Raises LeaseHeld."""
+        """Refuse what another client holds. Raises LeaseHeld."""
         self.leases.check(client, servos)
 
     def take(self, client: Hashable, label: str, servos: Collection[str]) -> None:
-        """By moving. Raises LeaseHeld."""
+        """Take servos by moving them. Raises LeaseHeld."""
         self._labels[client] = label
         self.leases.take(client, label, servos, self._loop.time())
         self._watch()
 
     def acquire(self, client: Hashable, label: str, servos: Collection[str]) -> set[str]:
-        """Raises LeaseHeld."""
+        """Take servos on request, and return all that the client holds. Raises LeaseHeld."""
         self._labels[client] = label
         self.leases.acquire(client, label, servos, self._loop.time())
         self._watch()
@@ -51,14 +56,14 @@ class LeaseWatch:
         self.leases.release(client, servos)
 
     def gone(self, client: Hashable) -> None:
-        """Its connection is closed."""
+        """The connection of the client is closed."""
         servos = self.leases.gone(client)
         label = self._labels.pop(client, "")
         if servos:
             self._lose(label, servos, "its connection is closed")
 
-    def reloaded(self) -> None:
-        """Servos that are in the config no more belong to nobody."""
+    def forget_removed(self) -> None:
+        """After a reload: servos that are no longer in the config are held by nobody."""
         self.leases.forget(set(self.leases.holders()) - set(self._rig.names))
 
     async def close(self) -> None:
@@ -84,12 +89,12 @@ class LeaseWatch:
         self._watch()
 
     def _lose(self, label: str, servos: set[str], reason: str) -> None:
-        known = servos & set(self._rig.names)
-        self.leases.block(known, STOPPING)
+        present = servos & set(self._rig.names)
+        self.leases.block(present, STOPPING)
         log.warning("lease_lost", client=label, servos=sorted(servos), reason=reason)
         fields = {"client": label, "servos": sorted(servos), "reason": reason}
         self._rig.event_source.publish(Event(EventName.LEASE_LOST, self._loop.time(), fields))
-        task = asyncio.create_task(self._stop(known))
+        task = asyncio.create_task(self._stop(present))
         self._stopping.add(task)
         task.add_done_callback(self._stopping.discard)
 

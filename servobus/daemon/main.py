@@ -16,9 +16,8 @@ from servobus.daemon.sockets import claim
 from servobus.daemon.watchdog import Pulse, Watchdog
 from servobus.engine.stats import Counter
 from servobus.errors import ServobusError
-from servobus.rig.local import LocalRig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.rig.logs import EventLogger
-from servobus.rig.opening import open_rig
 
 LOOKS = 3
 """Looks at the buses within the time that the system's watchdog allows."""
@@ -57,7 +56,7 @@ async def _reload(rig: LocalRig, door: NativeDoor, notifier: Notifier, asked: as
         notifier.reloading()
         try:
             await rig.reload()
-            door.leasing.reloaded()
+            door.leases.forget_removed()
         except ServobusError as error:
             log.error("reload_refused", reason=str(error))
         notifier.ready(f"{len(rig.buses)} buses, {len(rig.names)} servos")

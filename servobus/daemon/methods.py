@@ -1,233 +1,207 @@
-"""What each method does with the rig. What needs no turn is answered at once; everything else is awaited in a task of its own."""
+"""What each method of the daemon does. The verbs of a rig follow their rows in `rig/verbs.py`; the rest is written here.
+
+A handler returns the result, or a coroutine to await for it: what needs no turn is answered at once.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Callable, Iterable
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
 
+from servobus import __version__
+from servobus.daemon.lease_watch import LeaseWatch
+from servobus.daemon.subscriptions import Subscriber, Subscriptions
 from servobus.errors import AccessDenied, LimitError, NotSupported
-from servobus.rig.interface import Found
-from servobus.rpc import methods as rpc
-from servobus.rpc.methods import METHODS, PROTOCOL, Greeting, Health, Lease
-from servobus.values import Goal
+from servobus.rig.local import LocalRig
+from servobus.rig.verbs import VERBS, LeaseRule, Verb, caller, servos
+from servobus.rpc.methods import (
+    METHODS,
+    PROTOCOL,
+    Greeting,
+    Hello,
+    LeaseGrant,
+    Names,
+    Nothing,
+    RigHealth,
+    Subscribe,
+    Unsubscribe,
+    needed_role,
+)
+from servobus.values import Health, Role, ScanHit
 
-if TYPE_CHECKING:
-    from servobus.daemon.connection import Connection
-
-LATER = Awaitable[Any]
-Verb = Callable[["Connection", Any], Any]
-"""Returns the result, or something to await for it."""
-
-
-def hello(client: Connection, params: rpc.Hello) -> Greeting:
-    if params.protocol != PROTOCOL:
-        raise NotSupported(
-            f"this daemon speaks protocol {PROTOCOL}, you speak {params.protocol}: use a client of version {VERSION}"
-        )
-    client.greet(params)
-    rig = client.door.rig
-    ttl = round(1e3 * client.door.leasing.leases.ttl)
-    return Greeting("servobus", VERSION, PROTOCOL, os.getpid(), str(client.role), ttl, dict(rig.names), rig.stopped)
-
-
-def read(client: Connection, params: rpc.Read) -> Any:
-    rig = client.door.rig
-    known = None if params.max_age is None else rig.known(params.name, params.max_age)
-    return rig.read(params.name, max_age=params.max_age) if known is None else known
+MAX_SCAN = 65_536
+"""Ids and rates of one scan."""
+MAX_SETTLE = 3600.0
+"""Seconds."""
 
 
-def snapshot(client: Connection, params: rpc.Names) -> Any:
-    rig = client.door.rig
-    states = rig.snapshot()
-    return {name: states[name] for name in rig.full_names(params.names)}
+class Client(Subscriber, Protocol):
+    """What a handler needs of the connection that calls it."""
+
+    role: Role
+
+    @property
+    def label(self) -> str:
+        """Its name for others."""
+
+    def greet(self, params: Hello) -> None:
+        """Take its name and token. Raises AccessDenied."""
+
+    def notify(self, method: str, params: Any) -> None: ...
 
 
-def health(client: Connection, _: rpc.Nothing) -> Health:
-    rig = client.door.rig
-    states = rig.snapshot()
-    buses = {name: bus.master.up for name, bus in rig.buses.items()}
-    servos = {name: state.health.value for name, state in states.items()}
-    faults = {name: state.faults for name, state in states.items() if state.faults}
-    ok = not rig.stopped and all(buses.values()) and all(each == "online" for each in servos.values())
-    return Health(ok, rig.stopped, buses, servos, faults)
+@dataclass(frozen=True, slots=True)
+class Services:
+    """What the connections of one daemon share."""
+
+    rig: LocalRig
+    leases: LeaseWatch
+    subscriptions: Subscriptions
 
 
-def config(client: Connection, _: rpc.Nothing) -> Any:
-    """Of the buses alone: who may come in, and by what token, is nobody's business."""
-    setup = client.door.rig.config
-    buses = {name: setup.buses[name].model_dump(mode="json") for name in client.door.rig.buses}
-    return {"version": setup.version, "buses": buses}
+Handler = Callable[[Services, Client, Any], Any]
 
 
-# Motion
+def _verb_handler(verb: Verb) -> Handler:
+    """The handler of a verb: the lease rule of its row first, then the call."""
+    call = caller(verb)
+
+    def free(services: Services, client: Client, params: Any) -> Any:
+        services.leases.check(client, servos(verb, services.rig, params))
+        return call(services.rig, params)
+
+    def taken(services: Services, client: Client, params: Any) -> Any:
+        names = servos(verb, services.rig, params)
+        if not services.rig.stopped:  # what the e-stop refuses takes no lease
+            services.leases.take(client, client.label, names)
+        return call(services.rig, params)
+
+    rules: dict[LeaseRule, Handler] = {LeaseRule.FREE: free, LeaseRule.TAKEN: taken}
+    return rules.get(verb.lease, lambda services, _, params: call(services.rig, params))
 
 
-def _moved(client: Connection, names: Iterable[str]) -> None:
-    """Raises UnknownName, LeaseHeld. What cannot move (the e-stop is latched) takes no lease either."""
-    full = [client.door.rig.full_name(name) for name in names]
-    if not client.door.rig.stopped:
-        client.door.leasing.take(client, client.label, full)
+# Verbs with something of their own
 
 
-def _free(client: Connection, names: Iterable[str]) -> None:
-    client.door.leasing.check(client, client.door.rig.full_names(names))
+def read(services: Services, _: Client, params: Any) -> Any:
+    rig = services.rig
+    state = None if params.max_age is None else rig.recent(params.name, params.max_age)
+    return rig.read(params.name, max_age=params.max_age) if state is None else state
 
 
-def _bus_free(client: Connection, bus: str) -> None:
-    client.door.leasing.check(client, [name for name, place in client.door.rig.names.items() if place[0] == bus])
+def settle(services: Services, _: Client, params: Any) -> Any:
+    return services.rig.settle(*params.names, tolerance=params.tolerance, timeout=min(params.timeout, MAX_SETTLE))
 
 
-def move(client: Connection, params: rpc.Move) -> LATER:
-    _moved(client, params.positions)
-    keys = {key: getattr(params, key) for key in ("together", "confirm", "speed", "duration", "start_within")}
-    return client.door.rig.move(params.positions, **keys)
-
-
-def move_to(client: Connection, params: rpc.MoveTo) -> LATER:
-    _moved(client, [params.name])
-    keys = {key: getattr(params, key) for key in ("speed", "duration", "acceleration", "effort", "start_within", "confirm")}
-    return client.door.rig[params.name].move_to(params.position, **keys)
-
-
-def spin(client: Connection, params: rpc.Spin) -> LATER:
-    _moved(client, [params.name])
-    return client.door.rig[params.name].spin(params.velocity, acceleration=params.acceleration, effort=params.effort)
-
-
-def send_all(client: Connection, params: rpc.SendAll) -> LATER:
-    _moved(client, params.goals)
-    goals: dict[str, Goal] = params.goals
-    return client.door.rig.send_all(goals, together=params.together, confirm=params.confirm)
-
-
-def enable(client: Connection, params: rpc.Names) -> LATER:
-    _free(client, params.names)
-    return client.door.rig.enable(*params.names)
-
-
-def disable(client: Connection, params: rpc.Names) -> LATER:
-    _free(client, params.names)
-    return client.door.rig.disable(*params.names)
-
-
-def write_register(client: Connection, params: rpc.WriteRegister) -> LATER:
-    _free(client, [params.name])
-    rig = client.door.rig
-    return rig.write_register(params.name, params.register, params.value, raw=params.raw, persist=params.persist)
-
-
-def set_id(client: Connection, params: rpc.SetId) -> LATER:
-    _bus_free(client, params.bus)
-    return client.door.rig.set_id(params.bus, params.node, params.new, save=params.save)
-
-
-def set_baudrate(client: Connection, params: rpc.SetBaudrate) -> LATER:
-    _bus_free(client, params.bus)
-    return client.door.rig.set_baudrate(params.bus, params.node, params.baudrate, save=params.save)
-
-
-def command(client: Connection, params: rpc.Command) -> LATER:
-    _bus_free(client, params.bus)
-    return client.door.rig.command(params.bus, params.node, params.name, params.value)
-
-
-def scan(client: Connection, params: rpc.Scan) -> LATER:
-    _bus_free(client, params.bus)
+def scan(services: Services, client: Client, params: Any) -> Any:
+    services.leases.check(client, servos(VERBS["scan"], services.rig, params))
     count = len(params.ids) * max(1, len(params.baudrates))
-    if count > 65_536 or not all(0 <= node <= 255 for node in params.ids):
-        raise LimitError("ids are 0 to 255, and there is an end to their number: scan fewer")
+    if count > MAX_SCAN or not all(0 <= node <= 255 for node in params.ids):
+        raise LimitError(f"scan: ids are 0 to 255, and {MAX_SCAN} ids and rates at most: scan fewer")
 
-    def progress(asked: int, total: int, hit: Found | None) -> None:
+    def progress(asked: int, total: int, hit: ScanHit | None) -> None:
         client.notify("progress", {"bus": params.bus, "asked": asked, "count": total, "found": hit})
 
-    told = progress if params.progress else None
-    return client.door.rig.scan(params.bus, baudrates=params.baudrates, ids=params.ids, progress=told)
+    report = progress if params.progress else None
+    return services.rig.scan(params.bus, baudrates=params.baudrates, ids=params.ids, progress=report)
 
 
-# Leases
-
-
-def acquire(client: Connection, params: rpc.Names) -> Lease:
-    held = client.door.leasing.acquire(client, client.label, client.door.rig.full_names(params.names))
-    return _lease(client, held)
-
-
-def renew(client: Connection, _: rpc.Nothing) -> Lease:
-    return _lease(client, client.door.leasing.renew(client))
-
-
-def release(client: Connection, params: rpc.Names) -> None:
-    client.door.leasing.release(client, client.door.rig.full_names(params.names))
-
-
-def _lease(client: Connection, held: set[str]) -> Lease:
-    return Lease(tuple(sorted(held)), round(1e3 * client.door.leasing.leases.ttl))
-
-
-# The door itself
-
-
-async def reload(client: Connection, _: rpc.Nothing) -> Any:
-    report = await client.door.rig.reload()
-    client.door.leasing.reloaded()
+async def reload(services: Services, _: Client, __: Nothing) -> Any:
+    report = await services.rig.reload()
+    services.leases.forget_removed()
     return report
 
 
-def subscribe(client: Connection, params: rpc.Subscribe) -> int:
-    return client.door.subscriptions.add(client, params)
+def acquire(services: Services, client: Client, params: Names) -> LeaseGrant:
+    return _grant(services, services.leases.acquire(client, client.label, services.rig.full_names(params.names)))
 
 
-def unsubscribe(client: Connection, params: rpc.Unsubscribe) -> None:
-    client.door.subscriptions.remove(client, params.subscription)
+def renew(services: Services, client: Client, _: Nothing) -> LeaseGrant:
+    return _grant(services, services.leases.renew(client))
 
 
-VERBS: dict[str, Verb] = {
-    "hello": hello,
-    "stop": lambda client, _: client.door.rig.stop(),
-    "names": lambda client, _: dict(client.door.rig.names),
+def release(services: Services, client: Client, params: Names) -> None:
+    services.leases.release(client, services.rig.full_names(params.names))
+
+
+def _grant(services: Services, names: set[str]) -> LeaseGrant:
+    return LeaseGrant(tuple(sorted(names)), services.leases.lease_ms)
+
+
+# The daemon itself
+
+
+def hello(services: Services, client: Client, params: Hello) -> Greeting:
+    if params.protocol != PROTOCOL:
+        raise NotSupported(
+            f"this daemon speaks protocol {PROTOCOL}, you speak {params.protocol}: use a client of version {__version__}"
+        )
+    client.greet(params)
+    rig, role = services.rig, str(client.role)
+    return Greeting("servobus", __version__, PROTOCOL, os.getpid(), role, services.leases.lease_ms, dict(rig.names), rig.stopped)
+
+
+def snapshot(services: Services, _: Client, params: Names) -> Any:
+    states = services.rig.snapshot()
+    return {name: states[name] for name in services.rig.full_names(params.names)}
+
+
+def health(services: Services, _: Client, __: Nothing) -> RigHealth:
+    rig = services.rig
+    states = rig.snapshot()
+    buses = {name: bus.master.up for name, bus in rig.buses.items()}
+    nodes = {name: state.health.value for name, state in states.items()}
+    faults = {name: state.faults for name, state in states.items() if state.faults}
+    ok = not rig.stopped and all(buses.values()) and all(each == Health.ONLINE for each in nodes.values())
+    return RigHealth(ok, rig.stopped, buses, nodes, faults)
+
+
+def config(services: Services, _: Client, __: Nothing) -> Any:
+    """The buses alone: who has access, and by what token, stays secret."""
+    setup = services.rig.config
+    buses = {name: setup.buses[name].model_dump(mode="json") for name in services.rig.buses}
+    return {"version": setup.version, "buses": buses}
+
+
+def subscribe(services: Services, client: Client, params: Subscribe) -> int:
+    return services.subscriptions.add(client, params)
+
+
+def unsubscribe(services: Services, client: Client, params: Unsubscribe) -> None:
+    services.subscriptions.remove(client, params.subscription)
+
+
+HANDLERS: dict[str, Handler] = {
+    **{verb.name: _verb_handler(verb) for verb in VERBS.values() if verb.door},
     "read": read,
-    "snapshot": snapshot,
-    "stopped": lambda client, _: client.door.rig.stopped,
-    "settle": lambda client, params: client.door.rig.settle(
-        *params.names, tolerance=params.tolerance, timeout=min(params.timeout, 3600.0)
-    ),
-    "read_register": lambda client, params: client.door.rig.read_register(params.name, params.register, raw=params.raw),
-    "ping": lambda client, params: client.door.rig.ping(params.name),
-    "identify": lambda client, params: client.door.rig.identify(params.name),
-    "health": health,
-    "stats": lambda client, _: client.door.rig.stats(),
-    "config": config,
-    "leases": lambda client, _: client.door.leasing.leases.holders(),
-    "subscribe": subscribe,
-    "unsubscribe": unsubscribe,
-    "move": move,
-    "move_to": move_to,
-    "spin": spin,
-    "send_all": send_all,
-    "enable": enable,
-    "disable": disable,
-    "clear": lambda client, _: client.door.rig.clear(),
+    "settle": settle,
+    "scan": scan,
+    "reload": reload,
     "acquire": acquire,
     "renew": renew,
     "release": release,
-    "write_register": write_register,
-    "scan": scan,
-    "set_id": set_id,
-    "set_baudrate": set_baudrate,
-    "command": command,
-    "reload": reload,
+    "hello": hello,
+    "names": lambda services, _, __: dict(services.rig.names),
+    "snapshot": snapshot,
+    "stopped": lambda services, _, __: services.rig.stopped,
+    "health": health,
+    "stats": lambda services, _, __: services.rig.stats(),
+    "config": config,
+    "leases": lambda services, _, __: services.leases.holders(),
+    "subscribe": subscribe,
+    "unsubscribe": unsubscribe,
 }
-VERSION = version("servobus")
 
 
-def require(client: Connection, method: str, params: Any) -> None:
-    """Deny by default. Raises AccessDenied."""
-    needed = rpc.needed_role(method, params)
-    if client.role < needed:
-        if client.role is METHODS["hello"].role:
-            raise AccessDenied("say hello first, with the token")
-        raise AccessDenied(
-            f"{method} is for the role {needed}, you are {client.role}: ask who runs the daemon (access: in its config)"
-        )
+def require_role(client: Client, method: str, params: Any) -> None:
+    """Refuse a call that the client's role does not allow. Raises AccessDenied."""
+    needed = needed_role(method, params)
+    if client.role >= needed:
+        return
+    if client.role is METHODS["hello"].role:
+        raise AccessDenied("say hello first, with the token")
+    raise AccessDenied(
+        f"{method} is for the role {needed}, you are {client.role}: ask who runs the daemon (access: in its config)"
+    )

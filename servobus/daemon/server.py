@@ -1,4 +1,4 @@
-"""NativeDoor: what the connections share, and how it is opened and closed."""
+"""NativeDoor: what the connections of one daemon share, who may connect, and how it opens and closes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from functools import partial
 from pathlib import Path
 
 from servobus.config.access import Role
-from servobus.daemon.connection import Connection
+from servobus.daemon.connection import ClientConnection
 from servobus.daemon.fairness import FairShare
 from servobus.daemon.lease_watch import LeaseWatch
+from servobus.daemon.methods import Services
 from servobus.daemon.sockets import BACKLOG, Tokens, claim, inode, peer_credentials, remove, tls_context
 from servobus.daemon.subscriptions import Subscriptions
 from servobus.errors import ConfigError, Overloaded, ServobusError
@@ -23,14 +24,19 @@ from servobus.rig.logs import EventLogger
 HANDSHAKE = 5.0
 """Seconds."""
 CLOSING = 1.0
-"""Seconds that clients get to leave at the end."""
+"""Seconds that connections get to close at the end."""
 
 log = EventLogger("servobus.daemon")
 
 
 class NativeDoor:
-    """One rig, many clients. `owner`: the user whose daemon it is. `handshake`: seconds for a TCP client to show its token, and
-    before that for TLS."""
+    """One rig for many clients.
+
+    Args:
+        rig: The rig.
+        owner: User id of the daemon's owner.
+        handshake: Seconds for a TCP client to show its token, and before that for TLS.
+    """
 
     def __init__(self, rig: LocalRig, owner: int, *, handshake: float = HANDSHAKE) -> None:
         self.rig: LocalRig = rig
@@ -39,23 +45,24 @@ class NativeDoor:
         self.handshake = handshake
         self.loop = asyncio.get_running_loop()
         self.now = self.loop.time
-        self.work = FairShare(self.loop)
-        self.leasing: LeaseWatch = LeaseWatch(rig, self.options.lease_ms / 1000)
-        self.subscriptions: Subscriptions = Subscriptions(rig)
+        self.share = FairShare(self.loop)
+        self.leases = LeaseWatch(rig, self.options.lease_ms)
+        self.subscriptions = Subscriptions(rig)
+        self.services = Services(rig, self.leases, self.subscriptions)
         self.addresses: list[str] = []
         """Where it listens, for people."""
-        self.connections: dict[Connection, str] = {}
+        self.connections: dict[ClientConnection, str] = {}
         """Client -> whose it counts as."""
         self._count: Counter[str] = Counter()
         self._tokens: Tokens | None = None
         self._servers: list[asyncio.Server] = []
         self._empty = asyncio.Event()
-        """After closing: everybody has left."""
+        """After closing: no connection is left."""
 
-    # Who comes in
+    # Who may connect
 
-    def enter(self, client: Connection, sock: socket.socket, *, tcp: bool) -> ServobusError | None:
-        """What keeps it out; None: it is in, with the role that its credentials give."""
+    def enter(self, client: ClientConnection, sock: socket.socket, *, tcp: bool) -> ServobusError | None:
+        """Count a new connection, and give it the role of its credentials. Returns the error that refuses it, or None."""
         if tcp:
             address = str(sock.getpeername()[0])
             owner, client.who = f"tcp {address}", address
@@ -74,8 +81,8 @@ class NativeDoor:
             self.loop.call_later(self.handshake, self._late, client)
         return None
 
-    def admit(self, client: Connection, token: str | None) -> Role:
-        """The role that comes with the right token. Raises AccessDenied, Overloaded."""
+    def admit(self, client: ClientConnection, token: str | None) -> Role:
+        """Return the role of a client that showed the right token. Raises AccessDenied, Overloaded."""
         assert self._tokens is not None
         assert self.options.tcp is not None
         try:
@@ -86,36 +93,36 @@ class NativeDoor:
             raise
         return Role[self.options.tcp.role.upper()]
 
-    def leave(self, client: Connection) -> None:
+    def leave(self, client: ClientConnection) -> None:
         owner = self.connections.pop(client, None)
         if owner is not None:
             self._count[owner] -= 1
             if not self._count[owner]:
                 del self._count[owner]
         self.subscriptions.gone(client)
-        self.leasing.gone(client)
+        self.leases.gone(client)
         if not self.connections:
             self._empty.set()
 
-    def _late(self, client: Connection) -> None:
+    def _late(self, client: ClientConnection) -> None:
         if client in self.connections and client.role is Role.NOBODY:
             client.abort()
 
     # Open and closed
 
     async def listen(self, listener: socket.socket, path: Path) -> None:
-        """On the claimed socket, and on TCP where the config has it. Raises ConfigError."""
-        self._servers.append(await self.loop.create_unix_server(partial(Connection, self), sock=listener, backlog=BACKLOG))
+        """Listen on the claimed socket, and on TCP where the config says so. Raises ConfigError."""
+        self._servers.append(await self.loop.create_unix_server(partial(ClientConnection, self), sock=listener, backlog=BACKLOG))
         self.addresses.append(str(path))
         tcp = self.options.tcp
         if tcp is None:
             return
         self._tokens, context = Tokens(tcp), tls_context(tcp)
         try:
-            build = partial(Connection, self, tcp=True)
-            patience = None if context is None else self.handshake
+            build = partial(ClientConnection, self, tcp=True)
+            limit = None if context is None else self.handshake
             server = await self.loop.create_server(
-                build, tcp.host, tcp.port, ssl=context, backlog=BACKLOG, ssl_handshake_timeout=patience
+                build, tcp.host, tcp.port, ssl=context, backlog=BACKLOG, ssl_handshake_timeout=limit
             )
         except OSError as error:
             raise ConfigError(f"door.tcp: {tcp.host}:{tcp.port} cannot be listened at ({error.strerror})") from None
@@ -125,7 +132,7 @@ class NativeDoor:
             self.addresses.append(f"tcp://{host}:{port}")
 
     async def close(self) -> None:
-        """Nobody comes in any more; whoever is in is told by the end of the connection."""
+        """Accept nobody any more, and close every connection."""
         for server in self._servers:
             server.close()
         self.subscriptions.close()
@@ -138,15 +145,15 @@ class NativeDoor:
             with suppress(TimeoutError):
                 async with asyncio.timeout(CLOSING):
                     await self._empty.wait()
-        await self.leasing.close()
+        await self.leases.close()
 
 
 @asynccontextmanager
 async def open_door(
     rig: LocalRig, path: Path, *, owner: int, listener: socket.socket | None = None, handshake: float = HANDSHAKE
 ) -> AsyncIterator[NativeDoor]:
-    """The door of `rig` at `path`, until the context ends. `listener`: that socket, where it was claimed already. `handshake`: as
-    NativeDoor has it. Raises ConfigError, PortBusy."""
+    """Serve `rig` at the socket `path` until the context ends. `listener`: that socket, where it is claimed already; `owner` and
+    `handshake` as in NativeDoor. Raises ConfigError, PortBusy."""
     listener = claim(path) if listener is None else listener
     own = inode(path)
     door = NativeDoor(rig, owner, handshake=handshake)

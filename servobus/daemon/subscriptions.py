@@ -1,7 +1,7 @@
-"""Who wants to be told what, and how often. One timer for all; the latest value wins.
+"""Subscriptions of all clients: states and statistics at a rate, events as they happen. One timer serves all.
 
-Points of the grid are spread over the period, and each servo's state is written out at most once for all who want it at a moment.
-A client that does not read is passed over, and told how much it missed.
+The latest value wins. The times of subscriptions are spread over their period, and the state of a servo is encoded at most once
+for all that are served at a moment. A client that does not read is skipped; `missed` in its next notice says how often.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Hashable
+from enum import StrEnum
+from typing import Protocol
 
 from servobus.daemon.jsonrpc import encode, notification
 from servobus.errors import NotSupported, Overloaded, UnknownName
@@ -18,26 +20,38 @@ from servobus.rig.local import LocalRig
 from servobus.rpc.methods import MAX_HZ, MAX_SUBSCRIPTIONS, MIN_HZ, Subscribe
 from servobus.values import State
 
-if TYPE_CHECKING:
-    from servobus.daemon.connection import Connection
 
-TOPICS = ("state", "events", "stats")
+class Topic(StrEnum):
+    STATE = "state"
+    EVENTS = "events"
+    STATS = "stats"
+
+
 FIELDS = frozenset(State.__dataclass_fields__)
 SAME_MOMENT = 0.004
-"""Seconds for which what was written out is good for another subscription."""
+"""Seconds for which an encoded state is good for another subscription."""
 SHARE = 64
 """Subscriptions served in one pass of the loop."""
 SPREAD = 0.618
 
 
+class Subscriber(Hashable, Protocol):
+    """What a subscription needs of the connection of its client."""
+
+    blocked: bool
+    """The client does not read what was written."""
+
+    def write(self, data: bytes) -> None: ...
+
+
 class Subscription:
-    """`missed` counts what its client did not get."""
+    """`missed` counts the notices that the client did not get."""
 
     __slots__ = ("client", "due", "fields", "id", "missed", "names", "period", "topic")
 
-    def __init__(self, number: int, client: Connection, params: Subscribe, names: tuple[str, ...], due: float) -> None:
+    def __init__(self, number: int, client: Subscriber, params: Subscribe, names: tuple[str, ...], due: float) -> None:
         self.id = number
-        self.client: Connection | None = client
+        self.client: Subscriber | None = client
         self.topic = params.topic
         self.names = names
         self.fields = params.fields
@@ -50,7 +64,7 @@ class Subscription:
 
 
 class Subscriptions:
-    """All of one door."""
+    """All subscriptions of one daemon."""
 
     def __init__(self, rig: LocalRig) -> None:
         self._rig = rig
@@ -58,18 +72,18 @@ class Subscriptions:
         self._numbers = itertools.count(1)
         self._phase = 0.0
         self._heap: list[Subscription] = []
-        self._of: dict[Connection, dict[int, Subscription]] = {}
+        self._of: dict[Subscriber, dict[int, Subscription]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         """Kept here: a timer of uvloop that is due already does not say when."""
-        self._written: dict[str, bytes] = {}
-        self._written_at = -1.0
+        self._encoded: dict[str, bytes] = {}
+        self._encoded_at = -1.0
         self._unlisten = rig.event_source.subscribe(self._event)
 
-    def add(self, client: Connection, params: Subscribe) -> int:
-        """Raises NotSupported, UnknownName, Overloaded."""
-        if params.topic not in TOPICS:
-            raise NotSupported(f"no topic {params.topic!r}: there are {', '.join(TOPICS)}")
+    def add(self, client: Subscriber, params: Subscribe) -> int:
+        """Begin one, and return its number. Raises NotSupported, UnknownName, Overloaded."""
+        if params.topic not in set(Topic):
+            raise NotSupported(f"no topic {params.topic!r}: there are {', '.join(Topic)}")
         if not MIN_HZ <= params.hz <= MAX_HZ:
             raise NotSupported(f"{params.hz:g} Hz is outside {MIN_HZ:g} to {MAX_HZ:g}")
         if unknown := set(params.fields) - FIELDS:
@@ -82,24 +96,21 @@ class Subscriptions:
         due = self._loop.time() + self._phase / params.hz
         added = Subscription(next(self._numbers), client, params, names, due)
         mine[added.id] = added
-        if added.topic != "events":
+        if added.topic != Topic.EVENTS:
             heapq.heappush(self._heap, added)
             self._arm()
         return added.id
 
-    def remove(self, client: Connection, number: int) -> None:
-        """Raises UnknownName."""
-        found = self._of.get(client, {}).pop(number, None)
-        if found is None:
+    def remove(self, client: Subscriber, number: int) -> None:
+        """End one. Raises UnknownName."""
+        subscription = self._of.get(client, {}).pop(number, None)
+        if subscription is None:
             raise UnknownName(f"no subscription {number} on this connection")
-        found.client = None
+        subscription.client = None
 
-    def gone(self, client: Connection) -> None:
+    def gone(self, client: Subscriber) -> None:
         for subscription in self._of.pop(client, {}).values():
             subscription.client = None
-
-    def has(self, client: Connection) -> bool:
-        return bool(self._of.get(client))
 
     def close(self) -> None:
         self._unlisten()
@@ -129,39 +140,39 @@ class Subscriptions:
             self._send(subscription, subscription.client, int(steps) - 1, now)
         self._arm()
 
-    def _send(self, subscription: Subscription, client: Connection, skipped: int, now: float) -> None:
+    def _send(self, subscription: Subscription, client: Subscriber, skipped: int, now: float) -> None:
         subscription.missed += skipped
         if client.blocked:
             subscription.missed += 1
             return
         head = b'{"subscription":%d,"missed":%d,' % (subscription.id, subscription.missed)
-        if subscription.topic == "stats":
-            body = b'"stats":%b}' % encode(self._rig.stats())
+        if subscription.topic == Topic.STATS:
+            rest = b'"stats":%b}' % encode(self._rig.stats())
         else:
-            body = b'"stopped":%b,"states":%b}' % (encode(self._rig.stopped), self._states(subscription, now))
+            rest = b'"stopped":%b,"states":%b}' % (encode(self._rig.stopped), self._states(subscription, now))
         subscription.missed = 0
-        client.write(notification(subscription.topic, head + body))
+        client.write(notification(subscription.topic, head + rest))
 
     def _states(self, subscription: Subscription, now: float) -> bytes:
         names = [name for name in subscription.names or self._rig.names if name in self._rig.names]
         if subscription.fields:
             states = ((name, self._rig.state(name)) for name in names)
             return encode({name: {key: getattr(state, key) for key in subscription.fields} for name, state in states})
-        if now - self._written_at > SAME_MOMENT:
-            self._written.clear()
-            self._written_at = now
-        return b"{%b}" % b",".join(map(self._write, names))
+        if now - self._encoded_at > SAME_MOMENT:
+            self._encoded.clear()
+            self._encoded_at = now
+        return b"{%b}" % b",".join(map(self._encode, names))
 
-    def _write(self, name: str) -> bytes:
-        found = self._written.get(name)
-        if found is None:
-            found = self._written[name] = b"%b:%b" % (encode(name), encode(self._rig.state(name)))
-        return found
+    def _encode(self, name: str) -> bytes:
+        state = self._encoded.get(name)
+        if state is None:
+            state = self._encoded[name] = b"%b:%b" % (encode(name), encode(self._rig.state(name)))
+        return state
 
     def _event(self, event: Event) -> None:
         for client, mine in self._of.items():
             for subscription in mine.values():
-                if subscription.topic != "events":
+                if subscription.topic != Topic.EVENTS:
                     continue
                 if client.blocked:
                     subscription.missed += 1

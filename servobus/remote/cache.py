@@ -8,8 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from servobus.errors import LinkDown
-from servobus.rig.interface import Snapshot
-from servobus.values import Health, State
+from servobus.values import Health, Snapshot, State
 
 
 def received(state: State, now: float) -> State:

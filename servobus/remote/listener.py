@@ -19,9 +19,9 @@ from servobus.remote.connection import Connection
 from servobus.remote.leases import ClientLeases
 from servobus.remote.session import DEADLINE, Dial, Session
 from servobus.rig.events import Event, EventSource, EventStream
-from servobus.rig.interface import Found, Rig, Snapshot
+from servobus.rig.interface import Rig
 from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
-from servobus.values import EventName
+from servobus.values import EventName, ScanHit, Snapshot
 
 SHORTEST_LEASE = 0.1
 """Seconds; no daemon makes us renew more often than that asks for."""
@@ -40,7 +40,7 @@ class Listening(Rig):
         self._refresh_hz = refresh_hz
         self._clock = asyncio.get_running_loop().time
         self._renaming: asyncio.Task[None] | None = None
-        self._scanning: dict[str, Callable[[int, int, Found | None], None]] = {}
+        self._scanning: dict[str, Callable[[int, int, ScanHit | None], None]] = {}
         self._watching: set[LatestSnapshot] = set()
         self.greeting: Greeting | None = None
         """What the daemon said of itself last."""
@@ -164,4 +164,4 @@ class Listening(Rig):
         progress = self._scanning.get(told["bus"])
         if progress is not None:
             found = told.get("found")
-            progress(told["asked"], told["count"], None if found is None else msgspec.convert(found, Found))
+            progress(told["asked"], told["count"], None if found is None else msgspec.convert(found, ScanHit))

@@ -18,9 +18,21 @@ from servobus.errors import InvalidRequest, LimitError, ServobusError
 from servobus.remote.address import address_of, token_of
 from servobus.remote.listener import Listening
 from servobus.remote.session import DEADLINE
-from servobus.rig.interface import Found, Reload, Snapshot
 from servobus.rpc.methods import MAX_HZ, MIN_HZ
-from servobus.values import GOAL_NUMBERS, Change, Goal, Identity, Outcome, State, StopReport, is_number, no_number
+from servobus.values import (
+    GOAL_NUMBERS,
+    Change,
+    Goal,
+    Identity,
+    Outcome,
+    Reload,
+    ScanHit,
+    Snapshot,
+    State,
+    StopReport,
+    is_number,
+    no_number,
+)
 
 T = TypeVar("T")
 FOREVER = 1e9
@@ -165,14 +177,14 @@ class RemoteRig(Listening):
         *,
         baudrates: Iterable[int] = (),
         ids: Iterable[int] = (),
-        progress: Callable[[int, int, Found | None], None] | None = None,
-    ) -> list[Found]:
+        progress: Callable[[int, int, ScanHit | None], None] | None = None,
+    ) -> list[ScanHit]:
         """As `Rig.scan`; one that its caller leaves goes on to its end at the daemon."""
         params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
         call = asyncio.ensure_future(self._session.call("scan", params))
         failed: list[Exception] = []
 
-        def report(asked: int, count: int, found: Found | None) -> None:
+        def report(asked: int, count: int, found: ScanHit | None) -> None:
             try:
                 if progress is not None and not failed:
                     progress(asked, count, found)
@@ -182,7 +194,7 @@ class RemoteRig(Listening):
 
         self._scanning[bus] = report
         try:
-            found: list[Found] = await call
+            found: list[ScanHit] = await call
         except asyncio.CancelledError:
             if failed:
                 raise failed[0] from None

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
+import anyio
 from anyio.abc import TaskGroup
 
 from servobus.bus.scan import scan
@@ -16,11 +18,11 @@ from servobus.config.loader import Config, load_config
 from servobus.errors import Busy, InvalidRequest, NotSupported, UnknownName
 from servobus.protocols.registry import PROTOCOLS
 from servobus.rig.events import Event, EventSource, EventStream
-from servobus.rig.interface import Found, Reload, Rig, Snapshot
+from servobus.rig.interface import Rig
 from servobus.rig.logs import EventLogger
-from servobus.rig.results import outcomes, raise_failures
+from servobus.rig.results import outcomes, raise_failures, uncancelled
 from servobus.rig.supervisor import BusSupervisor, Trace
-from servobus.values import Change, EventName, Goal, Identity, Outcome, State, StopReport
+from servobus.values import Change, EventName, Goal, Identity, Outcome, Reload, ScanHit, Snapshot, State, StopReport
 
 R = TypeVar("R")
 QUIET = {EventName.LINE_UP, EventName.ECHO_PROBED, EventName.ESTOP_CLEARED, EventName.SERVO_ONLINE, EventName.RELOADED}
@@ -225,12 +227,12 @@ class LocalRig(Rig):
         return await bus.read(servo, max_age)
 
     def state(self, name: str) -> State:
-        """What is known of one, without a turn."""
+        """The last known state of a servo, without a turn."""
         bus, servo = self.bus_of(name)
         return bus.state(servo)
 
-    def known(self, name: str, max_age: float) -> State | None:
-        """What `read` would answer without a turn; None: it would need one."""
+    def recent(self, name: str, max_age: float) -> State | None:
+        """The state that `read` would return without a turn; None: it needs one."""
         bus, servo = self.bus_of(name)
         return bus.state(servo) if bus.is_fresh(servo, max_age) else None
 
@@ -259,13 +261,13 @@ class LocalRig(Rig):
         *,
         baudrates: Iterable[int] = (),
         ids: Iterable[int] = (),
-        progress: Callable[[int, int, Found | None], None] | None = None,
-    ) -> list[Found]:
+        progress: Callable[[int, int, ScanHit | None], None] | None = None,
+    ) -> list[ScanHit]:
         service = self._bus(bus)
         every = PROTOCOLS[service.options.protocol].scan_ids
         found = []
         async for asked, count, entry in scan(service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)):
-            hit = None if entry is None else Found(bus, *entry)
+            hit = None if entry is None else ScanHit(bus, *entry)
             if hit:
                 found.append(hit)
             if progress:
@@ -301,3 +303,35 @@ class LocalRig(Rig):
 
     def events(self) -> EventStream:
         return self.event_source.stream()
+
+
+@asynccontextmanager
+async def open_rig(
+    config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False, trace: Trace | None = None
+) -> AsyncIterator[LocalRig]:
+    """Own the ports of a config until the context ends; then each servo enabled here is left as its `on_exit` says.
+
+    Args:
+        config: Path of the YAML file, or a loaded Config.
+        buses: Names of the buses to open; none: all.
+        degraded: True: a port that cannot be opened is waited for; False: it raises.
+        trace: Called with (bus, sent, bytes, monotonic seconds) for everything on the wire, both ways.
+
+    Returns: A context manager whose value is a LocalRig.
+    Raises: ConfigError, PortMissing, PortBusy, PortDenied, LinkDown.
+    """
+    path = None if isinstance(config, Config) else Path(config)
+    setup = config if isinstance(config, Config) else load_config(config)
+    failure: BaseException | None = None
+    async with anyio.create_task_group() as supervisors:
+        rig = LocalRig(setup, supervisors, buses, trace, path)
+        try:
+            await rig.start(degraded=degraded)
+            yield rig
+        except BaseException as error:  # noqa: BLE001 - raised again below, outside the group, which would wrap it
+            failure = error
+        cancelled = await uncancelled(rig.leave())
+        supervisors.cancel_scope.cancel()
+    cancelled = await uncancelled(rig.close()) or cancelled
+    if failure or cancelled:
+        raise failure or cancelled  # type: ignore[misc]

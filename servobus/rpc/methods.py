@@ -1,31 +1,33 @@
-"""The methods of the native door: the verbs of `Rig`, each with its parameters, its result and the least role that may call it.
+"""The methods of the daemon: each with its parameters, its result and the least role that may call it.
 
-One line of `METHODS` is all there is to say of a method; a door refuses what does not stand here.
+The verbs of a rig come from `rig/verbs.py`; only what a daemon has besides is written out here. Any other method is refused.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
-from servobus.rig.interface import Found, Reload
-from servobus.values import Change, Goal, Identity, Outcome, Role, State, StopReport
+from servobus.rig.verbs import DEADLINE, VERBS, LeaseRule, Verb, fields, signature
+from servobus.values import Role, State
 
 PROTOCOL = 1
-"""Of these messages: a client of another one is told so at `hello`."""
+"""Version of these messages. A client of another version is refused at `hello`."""
 MAX_LINE = 65_536
 """Bytes of one line, its end included."""
 MAX_DEPTH = 32
+"""Levels of one line."""
 MAX_BATCH = 100
+"""Calls in one array."""
 MAX_SUBSCRIPTIONS = 16
-"""Of one connection."""
+"""Subscriptions of one connection."""
 MIN_HZ, MAX_HZ = 0.1, 200.0
 
 
 class Params(msgspec.Struct, forbid_unknown_fields=True):
-    """By name, or by position in the order here."""
+    """Parameters of a method, given by name or by position in this order."""
 
 
 class Nothing(Params):
@@ -33,7 +35,7 @@ class Nothing(Params):
 
 
 class Hello(Params):
-    """First on TCP, where it must bring the token; on a Unix socket it may, to be known by a name."""
+    """The first call on TCP, with the token. On a Unix socket it is optional, and gives the client a name."""
 
     client: str = ""
     token: str | None = None
@@ -41,7 +43,7 @@ class Hello(Params):
 
 
 class Greeting(msgspec.Struct, frozen=True):
-    """What a client is told of the daemon."""
+    """What a daemon says of itself. `names` as `Rig.names`; `lease_ms`: how long a lease lasts without a renewal."""
 
     server: str
     version: str
@@ -50,7 +52,6 @@ class Greeting(msgspec.Struct, frozen=True):
     role: str
     lease_ms: int
     names: dict[str, tuple[str, str]]
-    """As `Rig.names`."""
     stopped: bool
 
 
@@ -60,102 +61,13 @@ class Names(Params):
     names: tuple[str, ...] = ()
 
 
-class Name(Params):
-    name: str
-
-
-class Move(Params):
-    positions: dict[str, Any]
-    together: bool = False
-    confirm: bool = False
-    speed: Any = None
-    duration: Any = None
-    start_within: Any = None
-
-
-class MoveTo(Params):
-    name: str
-    position: Any
-    speed: Any = None
-    duration: Any = None
-    acceleration: Any = None
-    effort: Any = None
-    start_within: Any = None
-    confirm: bool = False
-
-
-class Spin(Params):
-    name: str
-    velocity: Any
-    acceleration: Any = None
-    effort: Any = None
-
-
-class SendAll(Params):
-    goals: dict[str, Goal]
-    together: bool = False
-    confirm: bool = False
-
-
-class Settle(Params):
-    names: tuple[str, ...] = ()
-    tolerance: float | None = None
-    timeout: float = 10.0
-
-
-class Read(Params):
-    name: str
-    max_age: float | None = None
-
-
-class ReadRegister(Params):
-    name: str
-    register: str
-    raw: bool = False
-
-
-class WriteRegister(Params):
-    name: str
-    register: str
-    value: Any
-    raw: bool = False
-    persist: bool = False
-
-
-class Scan(Params):
-    bus: str
-    baudrates: tuple[int, ...] = ()
-    ids: tuple[int, ...] = ()
-    progress: bool = False
-    """Notices `progress` {bus, asked, count, found} while it lasts."""
-
-
-class SetId(Params):
-    bus: str
-    node: int
-    new: int
-    save: bool = False
-
-
-class SetBaudrate(Params):
-    bus: str
-    node: int
-    baudrate: int
-    save: bool = False
-
-
-class Command(Params):
-    bus: str
-    node: int
-    name: str
-    value: int | None = None
-
-
 class Subscribe(Params):
-    """`state`: snapshots at `hz` of `names`, of `fields` only if some are given; `events`: as they happen; `stats`: at `hz`.
+    """What to notify of.
 
+    `state`: snapshots at `hz` of `names`, of `fields` only if some are given; `stats`: at `hz`; `events`: as they happen.
     Notices: `state` {subscription, stopped, missed, states}, `event` {subscription, name, time, fields, missed}, `stats`
-    {subscription, missed, stats}."""
+    {subscription, missed, stats}.
+    """
 
     topic: str
     hz: float = 10.0
@@ -164,18 +76,20 @@ class Subscribe(Params):
 
 
 class Unsubscribe(Params):
+    """The number that `subscribe` returned."""
+
     subscription: int
 
 
-class Lease(msgspec.Struct, frozen=True):
-    """What this connection may move, and for how long without a word."""
+class LeaseGrant(msgspec.Struct, frozen=True):
+    """What this connection may move, and for how many milliseconds without a renewal."""
 
     names: tuple[str, ...]
     lease_ms: int
 
 
-class Health(msgspec.Struct, frozen=True):
-    """`ok`: every line is up, every servo online, and nothing is stopped."""
+class RigHealth(msgspec.Struct, frozen=True):
+    """`ok`: every line is up, every servo is online, and the e-stop is not latched."""
 
     ok: bool
     stopped: bool
@@ -184,57 +98,48 @@ class Health(msgspec.Struct, frozen=True):
     servos: dict[str, str]
     """online, doubtful or offline."""
     faults: dict[str, tuple[str, ...]]
-    """Of those that have any."""
+    """Of the servos that have any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
+    """One row of the method table. `result` is a type that msgspec can read."""
+
     params: type[Params]
     result: Any
-    """A type that msgspec can read."""
     role: Role
     motion: bool = False
-    """Needs the motion lease of its servos, and takes it if it is free."""
+    """It takes the motion leases of its servos."""
+    deadline: float = DEADLINE
+    """Seconds a client waits for the reply; `scan` from one `progress` notice to the next."""
+
+
+def _method(verb: Verb) -> Method:
+    """A verb as a method: a message with the fields of its signature."""
+    title = "".join(part.capitalize() for part in verb.name.split("_"))
+    doc = {"__doc__": verb.function.__doc__}
+    made = msgspec.defstruct(title, fields(verb), bases=(Params,), namespace=doc, forbid_unknown_fields=True, module=__name__)
+    params = cast("type[Params]", made)
+    return Method(params, signature(verb).return_annotation, verb.role, verb.lease is LeaseRule.TAKEN, verb.deadline)
 
 
 METHODS: dict[str, Method] = {
     "hello": Method(Hello, Greeting, Role.NOBODY),
-    "stop": Method(Nothing, dict[str, StopReport], Role.OBSERVER),
     "names": Method(Nothing, dict[str, tuple[str, str]], Role.OBSERVER),
-    "read": Method(Read, State, Role.OBSERVER),
     "snapshot": Method(Names, dict[str, State], Role.OBSERVER),
     "stopped": Method(Nothing, bool, Role.OBSERVER),
-    "settle": Method(Settle, dict[str, State], Role.OBSERVER),
-    "read_register": Method(ReadRegister, Any, Role.OBSERVER),
-    "ping": Method(Name, int | None, Role.OBSERVER),
-    "identify": Method(Name, Identity, Role.OBSERVER),
-    "health": Method(Nothing, Health, Role.OBSERVER),
+    "health": Method(Nothing, RigHealth, Role.OBSERVER),
     "stats": Method(Nothing, dict[str, Any], Role.OBSERVER),
     "config": Method(Nothing, dict[str, Any], Role.OBSERVER),
     "leases": Method(Nothing, dict[str, str], Role.OBSERVER),
     "subscribe": Method(Subscribe, int, Role.OBSERVER),
     "unsubscribe": Method(Unsubscribe, None, Role.OBSERVER),
-    "move": Method(Move, dict[str, Outcome], Role.OPERATOR, motion=True),
-    "move_to": Method(MoveTo, Outcome, Role.OPERATOR, motion=True),
-    "spin": Method(Spin, Outcome, Role.OPERATOR, motion=True),
-    "send_all": Method(SendAll, dict[str, Outcome], Role.OPERATOR, motion=True),
-    "enable": Method(Names, None, Role.OPERATOR),
-    "disable": Method(Names, None, Role.OPERATOR),
-    "clear": Method(Nothing, None, Role.OPERATOR),
-    "acquire": Method(Names, Lease, Role.OPERATOR),
-    "renew": Method(Nothing, Lease, Role.OPERATOR),
-    "release": Method(Names, None, Role.OPERATOR),
-    "write_register": Method(WriteRegister, Any, Role.OPERATOR),
-    "scan": Method(Scan, list[Found], Role.OPERATOR),
-    "set_id": Method(SetId, Change, Role.ADMIN),
-    "set_baudrate": Method(SetBaudrate, Change, Role.ADMIN),
-    "command": Method(Command, tuple[str, ...], Role.ADMIN),
-    "reload": Method(Nothing, Reload, Role.ADMIN),
+    **{verb.name: _method(verb) for verb in VERBS.values() if verb.door},
+    "acquire": Method(Names, LeaseGrant, Role.OPERATOR),
+    "renew": Method(Nothing, LeaseGrant, Role.OPERATOR),
 }
 
 
 def needed_role(method: str, params: Params) -> Role:
-    """The least role for this very call: what stays in a servo for good is an admin's."""
-    if isinstance(params, WriteRegister) and params.persist:
-        return Role.ADMIN
-    return METHODS[method].role
+    """The least role for this call: what stays in a servo for good is an admin's."""
+    return Role.ADMIN if getattr(params, "persist", False) else METHODS[method].role

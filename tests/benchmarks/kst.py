@@ -23,7 +23,7 @@ import uvloop
 from servobus.config.loader import parse_config
 from servobus.protocols.kst.codec import Command, encode
 from servobus.rig.interface import Servo
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from tests.benchmarks.report import Report, Row, Target
 
 BAUDRATE = 512_000

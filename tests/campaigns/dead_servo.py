@@ -14,8 +14,7 @@ from pathlib import Path
 
 from servobus.config.loader import Config, parse_config
 from servobus.errors import LinkDown, ServobusError
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.simulation.line import SimulatedLine
 from servobus.simulation.link import simulated_line
 from servobus.simulation.pty import SimulatedPty

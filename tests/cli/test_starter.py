@@ -8,12 +8,12 @@ import pytest
 
 from servobus.cli.scan import Line, starter
 from servobus.config.loader import parse_config
-from servobus.rig.interface import Found
+from servobus.values import ScanHit
 
 PORT = "/dev/serial/by-id/usb-1a86: #1"
 LINE = Line("line", "sms", PORT)
-STS = Found("line", 1, 1_000_000, "sts", "STS3215", "3.10")
-SMS = Found("line", 7, 115_200, "sms", None, None)
+STS = ScanHit("line", 1, 1_000_000, "sts", "STS3215", "3.10")
+SMS = ScanHit("line", 7, 115_200, "sms", None, None)
 
 
 def test_everything_found_at_one_rate_is_in_it() -> None:
@@ -34,7 +34,7 @@ def test_a_line_has_one_rate_that_of_most(order: int) -> None:
 
 
 def test_what_no_model_fits_is_told_and_left_out() -> None:
-    doubled = Found("line", 3, 1_000_000, None, None, None, "answers, but not who it is: two servos with this id?")
+    doubled = ScanHit("line", 3, 1_000_000, None, None, None, "answers, but not who it is: two servos with this id?")
     made = starter(LINE, [STS, doubled, replace(doubled, id=4, note="", product="XY 9.9")])
     assert set(parse_config(made, "made").buses["line"].servos) == {"servo_1"}
     assert (
@@ -44,13 +44,13 @@ def test_what_no_model_fits_is_told_and_left_out() -> None:
 
 
 def test_nothing_but_strangers() -> None:
-    made = starter(LINE, [Found("line", 3, 9600, None, None, None)])
+    made = starter(LINE, [ScanHit("line", 3, 9600, None, None, None)])
     bus = parse_config(made, "made").buses["line"]
     assert (bus.baudrate, bus.servos) == (9600, {})
 
 
 def test_a_hand_is_its_six_fingers() -> None:
-    made = starter(Line("hands", "roh", PORT), [Found("hands", unit, 115_200, "v2", None, None) for unit in (2, 5)])
+    made = starter(Line("hands", "roh", PORT), [ScanHit("hands", unit, 115_200, "v2", None, None) for unit in (2, 5)])
     bus = parse_config(made, "made").buses["hands"]
     assert {servo.id for servo in bus.servos.values()} == {2, 5}
     assert len(bus.servos) == 12

@@ -16,7 +16,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from servobus.config.loader import parse_config
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Outcome
 from tests.clients.bus_process import served
 

@@ -14,8 +14,7 @@ from typing import Any
 from servobus.config.access import DoorOptions
 from servobus.config.loader import Config
 from servobus.daemon.server import HANDSHAKE, NativeDoor
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from tests.daemon_in_process import open_test_door
 from tests.simulated_rigs import config
 

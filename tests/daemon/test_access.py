@@ -15,10 +15,10 @@ import pytest
 
 from servobus.config.access import AccessOptions, DoorOptions, Role, TcpOptions
 from servobus.config.loader import parse_config
-from servobus.daemon.methods import VERBS
+from servobus.daemon.methods import HANDLERS
 from servobus.daemon.sockets import MAX_PATH, Tokens, claim, read_token
 from servobus.errors import AccessDenied, ConfigError, Overloaded, PortBusy
-from servobus.rpc.methods import METHODS, WriteRegister, needed_role
+from servobus.rpc.methods import METHODS, needed_role
 from tests.daemon.raw_client import Raw, dialled, served
 from tests.virtual_time import virtual
 
@@ -50,10 +50,10 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 
 
 def test_every_method_has_its_role_and_its_verb() -> None:
-    assert set(METHODS) == {"hello"} | OBSERVERS | OPERATORS | ADMINS == set(VERBS)
+    assert set(METHODS) == {"hello"} | OBSERVERS | OPERATORS | ADMINS == set(HANDLERS)
     for names, role in ((OBSERVERS, Role.OBSERVER), (OPERATORS, Role.OPERATOR), (ADMINS, Role.ADMIN)):
         assert {METHODS[name].role for name in names} == {role}
-    assert needed_role("write_register", WriteRegister("s1", "id", 2, persist=True)) is Role.ADMIN
+    assert needed_role("write_register", METHODS["write_register"].params("s1", "id", 2, persist=True)) is Role.ADMIN
 
 
 @pytest.mark.parametrize("role", list(Role))

@@ -211,7 +211,7 @@ async def test_how_motion_ends(end: str, place: float, tmp_path: Path) -> None:
                     await raw.call("renew")
         await asyncio.sleep(3)
         assert (await rig.read("s1")).position == pytest.approx(place, abs=6)
-        assert door.leasing.leases.holders() == {}
+        assert door.leases.holders() == {}
 
 
 @virtual

@@ -11,8 +11,7 @@ from servobus.config.loader import parse_config
 from servobus.engine.duplex import DuplexEngine
 from servobus.errors import ReplyTimeout
 from servobus.protocols.kst.simulated.device import KstDevice
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.simulation.link import SimulatedLink
 from tests.virtual_time import virtual
 

@@ -14,8 +14,7 @@ from servobus.errors import ConfigError, DeviceError, LinkDown, ServobusError
 from servobus.links import open_link
 from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.simulation.arm_server import ArmFaults, ArmServer
 from servobus.values import Outcome
 

@@ -15,7 +15,7 @@ import pytest
 from servobus.errors import LeaseHeld, LimitError, LinkDown
 from servobus.remote.rig import RemoteRig, connect
 from servobus.rig.events import Event
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Goal, Outcome
 from tests.daemon_in_process import open_test_door
 from tests.scripted_daemon import GREETING, STATE, failed, puppet_daemon

@@ -215,7 +215,7 @@ async def test_a_scan_goes_on_as_long_as_it_reports(tmp_path: Path) -> None:
             progress = {"id": scans[0], "bus": "arm", "asked": asked, "count": 4, "found": None}
             daemon.visitor.say({"method": "progress", "params": progress})
         daemon.visitor.say({"id": scans[0], "result": [{"bus": "arm", "id": 1, "baudrate": 5, "model": "sts"}]})
-        with pytest.raises(LinkDown, match="another version"):  # a Found has more fields
+        with pytest.raises(LinkDown, match="another version"):  # a ScanHit has more fields
             await scan
     assert seen == [(0, 4), (1, 4), (2, 4), (3, 4)]
 

@@ -13,9 +13,8 @@ from servobus.config.loader import Config
 from servobus.errors import Busy, DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.kst.codec import Command
 from servobus.protocols.kst.simulated.device import KstDevice
-from servobus.rig.interface import Found
 from servobus.simulation.link import SimulatedLink
-from servobus.values import Identity, State
+from servobus.values import Identity, ScanHit, State
 from tests.rig_kinds import Over, both, gone, two_buses
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
@@ -178,10 +177,10 @@ def gimbal() -> Config:
 @virtual
 async def test_scanning(over: Over, tmp_path: Path) -> None:
     async with over(config(), tmp_path) as (rig, _):
-        progress: list[tuple[int, int, Found | None]] = []
+        progress: list[tuple[int, int, ScanHit | None]] = []
         found = await rig.scan("arm", ids=range(4), progress=lambda *told: progress.append(told))
         assert [(hit.id, hit.model, hit.baudrate) for hit in found] == [(number, "sts", 1000000) for number in (1, 2, 3)]
-        assert all(isinstance(hit, Found) for hit in found)
+        assert all(isinstance(hit, ScanHit) for hit in found)
         assert progress == list(zip(range(1, 5), [4] * 4, [None, *found], strict=True))
         assert len(await rig.scan("arm")) == 3
         with pytest.raises(UnknownName, match="arm"):

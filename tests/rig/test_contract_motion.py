@@ -25,8 +25,7 @@ from servobus.errors import (
     ReplyTimeout,
     SettleTimeout,
 )
-from servobus.rig.interface import Reload
-from servobus.values import Goal, Outcome, State, StopReport
+from servobus.values import Goal, Outcome, Reload, State, StopReport
 from tests.rig_kinds import Over, both, gone, two_buses
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual

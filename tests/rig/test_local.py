@@ -9,7 +9,7 @@ import pytest
 
 from servobus.errors import GoalExpired, LimitError, NotEnabled, NotSupported, PartialFailure, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Outcome
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual

@@ -19,7 +19,7 @@ from servobus.errors import (
     UnknownName,
 )
 from servobus.protocols.sms.codec import Instruction
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Goal, Outcome
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from servobus.errors import EStopped, LeaseHeld, NotEnabled
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
 from servobus.values import Outcome
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual

@@ -8,8 +8,7 @@ from contextlib import suppress
 import pytest
 
 from servobus.errors import Busy, EStopped, InvalidRequest, NotEnabled, ServobusError
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from servobus.errors import Busy, ConfigError, EStopped, LinkDown, NotSupported, UnknownName
-from servobus.rig.interface import Reload
-from servobus.rig.opening import open_rig
+from servobus.rig.local import open_rig
+from servobus.values import Reload
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from servobus.rig.interface import Rig, Servo
-from servobus.rpc.methods import METHODS, Method, WriteRegister, needed_role
+from servobus.rpc.methods import METHODS, Method, needed_role
 from servobus.values import Outcome, Role, State
 
 LOCAL = {"events", "watch", "full_name", "full_names", "send"}
@@ -60,7 +60,6 @@ def test_roles() -> None:
         "command",
         "reload",
     }
-    write = WriteRegister("s1", "id", 1)
-    assert needed_role("write_register", write) is Role.OPERATOR
-    write.persist = True
-    assert needed_role("write_register", write) is Role.ADMIN
+    write = METHODS["write_register"].params
+    assert needed_role("write_register", write("s1", "id", 1)) is Role.OPERATOR
+    assert needed_role("write_register", write("s1", "id", 1, persist=True)) is Role.ADMIN
