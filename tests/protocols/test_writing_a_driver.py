@@ -15,8 +15,7 @@ from servobus.config.loader import Config
 from servobus.errors import LimitError, NotEnabled, ReplyTimeout
 from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.registry import PROTOCOLS
-from servobus.rig.local import LocalRig
-from servobus.rig.opening import open_rig
+from servobus.rig.local import LocalRig, open_rig
 from servobus.simulation.link import SimulatedLink
 from servobus.values import Outcome
 from tests.protocols.contract import CHECKS, Joined
