@@ -13,25 +13,26 @@ from servobus.links.tcp import TcpLink
 
 
 def _tcp(parts: SplitResult, baudrate: int) -> Link:
-    host, port = parts.hostname, parts.port  # .port raises ValueError if it is not a port number
-    if not host or not port or parts.path or parts.query or parts.fragment or parts.username is not None:
+    if parts.query:
         raise ValueError
-    host.encode("idna")  # raises UnicodeError, a ValueError, if it cannot be a host name
-    return TcpLink(host, port, baudrate)
+    return TcpLink(*_host_and_port(parts), baudrate)
 
 
 def _realman(parts: SplitResult, baudrate: int) -> Link:
-    host, tcp_port = parts.hostname, parts.port
     query = parse_qs(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
-    if not host or not tcp_port or parts.path or parts.fragment or parts.username is not None or set(query) - set(ARM_KEYS):
+    if any(len(values) > 1 or values[0] not in ARM_KEYS.get(key, ()) for key, values in query.items()):
         raise ValueError
-    if any(len(values) > 1 or values[0] not in ARM_KEYS[key] for key, values in query.items()):
-        raise ValueError
-    host.encode("idna")
     options = {key: int(values[0]) for key, values in query.items()}
-    return RealmanLink(
-        host, tcp_port, baudrate, port=options.get("port", 1), generation=options.get("generation"), volts=options.get("voltage")
-    )
+    port, generation, volts = options.get("port", 1), options.get("generation"), options.get("voltage")
+    return RealmanLink(*_host_and_port(parts), baudrate, port=port, generation=generation, volts=volts)
+
+
+def _host_and_port(parts: SplitResult) -> tuple[str, int]:
+    host, port = parts.hostname, parts.port  # .port raises ValueError if it is not a port number
+    if not host or not port or parts.path or parts.fragment or parts.username is not None:
+        raise ValueError
+    host.encode("idna")  # raises UnicodeError, a ValueError, if it cannot be a host name
+    return host, port
 
 
 ARM_KEYS = {"port": ("0", "1"), "generation": ("2", "3", "4"), "voltage": ("0", "5", "12", "24")}

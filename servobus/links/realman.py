@@ -15,7 +15,7 @@ import asyncio
 from collections.abc import Callable
 
 from servobus.errors import LinkDown
-from servobus.links.tcp import CONNECT_TIMEOUT, OPTIONS, explain_connect_error
+from servobus.links.tcp import CONNECT_TIMEOUT, SocketTransport, explain_connect_error
 from servobus.protocols.base import LineTraits
 from servobus.protocols.modbus.codec import BROADCAST, Frame, ModbusCodec
 from servobus.protocols.realman import codec
@@ -107,16 +107,13 @@ MODE_REFUSED = (
 )
 
 
-class RealmanTransport(asyncio.Protocol):
+class RealmanTransport(SocketTransport):
     """An open connection to an arm; see `links.base.Transport`."""
 
     def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
-        self._protocol = protocol
-        self._address = address
+        super().__init__(protocol, address)
         self._loop = asyncio.get_running_loop()
         self._lines = JsonLines()
-        self._socket: asyncio.Transport | None = None
-        self._error: LinkDown | None = LinkDown(f"{address} closed the connection: it is opened again")
         self._begun = False
         self._dialect = Dialect(2)
         self._call: tuple[asyncio.Future[Message], Accept] | None = None
@@ -157,19 +154,12 @@ class RealmanTransport(asyncio.Protocol):
 
     # The socket
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._socket = transport  # type: ignore[assignment]  # uvloop's transport has the methods, but not the base class
-        for level, option, value in OPTIONS:
-            transport.get_extra_info("socket").setsockopt(level, option, value)
-
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_timer()
         if self._call is not None and not self._call[0].done():
             self._call[0].set_exception(LinkDown(f"{self._address} closed the connection: is another program on the arm?"))
-        if self._error is not None and exc is not None:
-            self._error = LinkDown(f"{self._address} was lost ({exc}): it is opened again")
         if self._begun:
-            self._protocol.connection_lost(self._error)
+            super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Pass the Modbus reply on after all lines of this chunk: none of them can answer what the engine sends next."""
@@ -246,43 +236,25 @@ class RealmanTransport(asyncio.Protocol):
 
     def _on_silence(self) -> None:
         """Close the connection: a reply that arrives on it from now on could be taken for another one."""
-        self._lose(LinkDown(f"{self._address}: the arm does not answer: the connection is opened again"))
+        self.lose(LinkDown(f"{self._address}: the arm does not answer: the connection is opened again"))
 
     # The end
 
     def _send(self, message: Message) -> None:
-        if self._socket is not None:
-            self._socket.write(codec.encode(message))
+        self._socket.write(codec.encode(message))
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
 
-    def poll_input(self) -> bool:
-        """Return False: only the loop can read the socket."""
-        return False
-
-    def set_baudrate(self, baudrate: int) -> None:
-        """Do nothing: the traits of this link do not allow a change."""
-
-    def is_closing(self) -> bool:
-        return self._socket is None or self._socket.is_closing()
-
     def close(self) -> None:
         """Give the port back to the arm, then close."""
         command = self._dialect.close_mode() if self._begun else None
-        self._error = None
         self._stop_timer()
         if command is not None and not self.is_closing():
             self._send(command.message)
-        if self._socket is not None:
-            self._socket.close()
+        super().close()
 
-    def abort(self) -> None:
-        self._lose(None)
-
-    def _lose(self, error: LinkDown | None) -> None:
-        self._error = error
+    def lose(self, error: LinkDown | None) -> None:
         self._stop_timer()
-        if self._socket is not None:
-            self._socket.abort()
+        super().lose(error)

@@ -65,8 +65,8 @@ def explain_connect_error(address: str, error: OSError) -> LinkDown:
     return LinkDown(f"{address} cannot be reached ({reason}): check host, port and server")
 
 
-class TcpTransport(asyncio.Protocol):
-    """An open connection; see `links.base.Transport`. Adds to the socket's transport what it lacks, and translates its errors."""
+class SocketTransport(asyncio.Protocol):
+    """What links over TCP share: adds to the socket's transport what it lacks, and translates its errors."""
 
     def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
         self._protocol = protocol
@@ -74,34 +74,23 @@ class TcpTransport(asyncio.Protocol):
         self._error: LinkDown | None = LinkDown(f"{address} closed the connection: it is opened again")
         """The error to report when the connection ends."""
         self._socket: asyncio.Transport
-        # Saves one call per chunk. It is set here because uvloop reads the attribute before it calls connection_made.
-        self.data_received = protocol.data_received  # type: ignore[method-assign]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._socket = cast("asyncio.Transport", transport)  # uvloop's transport has the methods, but not the base class
         for level, option, value in OPTIONS:
             transport.get_extra_info("socket").setsockopt(level, option, value)
-        self._protocol.connection_made(self)  # type: ignore[arg-type]  # has a transport's methods, but not its base class
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._error is not None and exc is not None:
             self._error = LinkDown(f"{self._address} was lost ({exc}): it is opened again")
         self._protocol.connection_lost(self._error)
 
-    def write(self, data: bytes) -> None:
-        if self._socket.is_closing():
-            return
-        self._socket.write(data)
-        if self._socket.get_write_buffer_size() > MAX_UNSENT:
-            self._error = LinkDown(f"{self._address} takes no more bytes: is the server alive?")
-            self._socket.abort()
-
     def poll_input(self) -> bool:
         """Return False: only the loop can read the socket."""
         return False
 
     def set_baudrate(self, baudrate: int) -> None:
-        """Do nothing: the traits of this link do not allow a change."""
+        """Do nothing: the traits of these links do not allow a change."""
 
     def is_closing(self) -> bool:
         return self._socket.is_closing()
@@ -111,5 +100,29 @@ class TcpTransport(asyncio.Protocol):
         self._socket.close()
 
     def abort(self) -> None:
-        self._error = None
+        self.lose(None)
+
+    def lose(self, error: LinkDown | None) -> None:
+        """Close at once, and report this error."""
+        self._error = error
         self._socket.abort()
+
+
+class TcpTransport(SocketTransport):
+    """An open connection; see `links.base.Transport`."""
+
+    def __init__(self, protocol: asyncio.Protocol, address: str) -> None:
+        super().__init__(protocol, address)
+        # Saves one call per chunk. It is set here because uvloop reads the attribute before it calls connection_made.
+        self.data_received = protocol.data_received  # type: ignore[method-assign]
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._protocol.connection_made(self)  # type: ignore[arg-type]  # has a transport's methods, but not its base class
+
+    def write(self, data: bytes) -> None:
+        if self._socket.is_closing():
+            return
+        self._socket.write(data)
+        if self._socket.get_write_buffer_size() > MAX_UNSENT:
+            self.lose(LinkDown(f"{self._address} takes no more bytes: is the server alive?"))

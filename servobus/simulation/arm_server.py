@@ -32,21 +32,19 @@ CHATTER: Message = {
 
 @dataclass(frozen=True, slots=True)
 class ArmFaults:
-    """The share of replies, 0 to 1, that each fault hits."""
+    """The share of replies, 0 to 1, that each fault hits.
+
+    A reply is sent twice (duplicate), `late_s` seconds too late while those after it wait (late), in two pieces (split), without
+    its end (cut), or after an unsolicited line (chatter). With drop the connection ends instead.
+    """
 
     duplicate: float = 0.0
-    """The reply is sent twice."""
     late: float = 0.0
-    """The reply is sent `late_s` seconds too late, and those after it wait."""
     late_s: float = 0.0
     split: float = 0.0
-    """The reply arrives in two pieces."""
     cut: float = 0.0
-    """The end of the reply is lost, and the next line follows directly."""
     chatter: float = 0.0
-    """An unsolicited line precedes the reply."""
     drop: float = 0.0
-    """The connection ends instead."""
     seed: int = 0
 
 

@@ -47,27 +47,19 @@ class Command(IntEnum):
 BAUD_TABLE: dict[int, int] = {0: 9600, 1: 19200, 2: 38400, 3: 57600, 4: 115200, 5: 256000, 6: 512000, 7: 921600}
 """Code of the baud rate command -> rate (KST RS422, 3.1)."""
 
-REQUEST_SIZES: dict[int, int] = {
-    Command.SET_BAUD: 1,
-    Command.SET_ID: 1,
-    Command.SAVE: 4,
-    Command.READ_ID: 0,
-    Command.SET_POSITION: 2,
-    Command.READ_POSITION: 0,
-    Command.READ_STATUS: 0,
-    Command.READ_VERSION: 0,
+SIZES: dict[int, tuple[int, int | None]] = {
+    Command.SET_BAUD: (1, 1),
+    Command.SET_ID: (1, 1),
+    Command.SAVE: (4, None),
+    Command.READ_ID: (0, 1),
+    Command.SET_POSITION: (2, 2),
+    Command.READ_POSITION: (0, 2),
+    Command.READ_STATUS: (0, 2),
+    Command.READ_VERSION: (0, 4),
 }
-"""Command -> data bytes that it uses."""
-REPLY_SIZES: dict[int, int] = {
-    Command.SET_BAUD: 1,
-    Command.SET_ID: 1,
-    Command.READ_ID: 1,
-    Command.SET_POSITION: 2,
-    Command.READ_POSITION: 2,
-    Command.READ_STATUS: 2,
-    Command.READ_VERSION: 4,
-}
-"""Command -> data bytes that its reply uses. SAVE is missing, because the document defines no reply to it."""
+"""Command -> data bytes that it and its reply use. The document defines no reply to SAVE."""
+REQUEST_SIZES = {command: size for command, (size, _) in SIZES.items()}
+REPLY_SIZES = {command: size for command, (_, size) in SIZES.items() if size is not None}
 DATA_SIZES: dict[int, int] = {
     **REQUEST_SIZES,
     **{REPLY + command: size for command, size in REPLY_SIZES.items()},

@@ -6,10 +6,9 @@ the `reply_key`. An echo is never taken for a reply, because their codes differ.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from servobus.errors import EchoMismatch
 from servobus.protocols.base import Request
@@ -72,9 +71,9 @@ class KstRequest(Request[R]):
             raise self.settings.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
         return self.decode(reply)
 
-    @abstractmethod
     def decode(self, reply: Frame) -> R:
-        """Return the value of a reply that is not a refusal."""
+        """Return the value of a reply that is not a refusal. The default is for requests without one."""
+        return cast("R", None)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.frame.hex(' ')})"
@@ -115,9 +114,6 @@ class Fence(KstRequest[None]):
     def parse(self, replies: Sequence[Frame]) -> None:
         """Accept any reply."""
 
-    def decode(self, reply: Frame) -> None:
-        """Return nothing."""
-
 
 class SetValue(KstRequest[None]):
     """A set command, whose reply repeats its data (KST RS422, 3.1, 3.2, 3.5)."""
@@ -153,9 +149,6 @@ class Save(KstRequest[None]):
         super().__init__(settings, node, Command.SAVE, SAVE_DATA)
         self.service_time = self.quiet_after = settings.flash_time
 
-    def decode(self, reply: Frame) -> None:
-        """Return nothing: the document defines no data for this reply."""
-
 
 class UnansweredCommand(KstRequest[None]):
     """A command whose reply is not waited for; the line stays silent as long as a reply would take."""
@@ -169,7 +162,4 @@ class UnansweredCommand(KstRequest[None]):
         self.quiet_after = max(settings.guard, settings.flash_time if command == Command.SAVE else 0.0)
 
     def parse(self, replies: Sequence[Frame]) -> None:
-        """Return nothing."""
-
-    def decode(self, reply: Frame) -> None:
         """Return nothing."""

@@ -15,21 +15,8 @@ from typing import TypeVar
 
 from servobus.errors import DeviceError
 from servobus.protocols.base import Request
-from servobus.protocols.modbus.codec import (
-    BROADCAST,
-    MAX_READ,
-    MAX_WRITE,
-    READ_SIZE,
-    REFUSED,
-    REPLY_OVERHEAD,
-    WRITE_SIZE,
-    Frame,
-    Function,
-    encode,
-    pack,
-    reply_key,
-    unpack,
-)
+from servobus.protocols.modbus import codec
+from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, MAX_WRITE, REFUSED, WRITE_SIZE, Frame, Function, pack
 
 R = TypeVar("R")
 
@@ -83,13 +70,13 @@ class ModbusRequest(Request[R]):
     def __init__(self, timing: RtuTiming, unit: int, function: Function, data: bytes, repeated: bytes, size: int) -> None:
         """`repeated`: what the reply repeats, from its third byte on. `size`: bytes of the reply."""
         self.node = unit
-        self.frame = encode(unit, function, data)
+        self.frame = codec.encode(unit, function, data)
         self.function = function
         self.repeated = repeated
         self.replies = int(unit != BROADCAST)
         self.nodes = (unit,) if self.replies else ()
         self.reply_size = size
-        self.reply_key = reply_key(function, repeated)
+        self.reply_key = codec.reply_key(function, repeated)
         self.quiet_after = timing.gap if self.replies else timing.gap + timing.turnaround
 
     def answers(self, reply: Frame) -> bool:
@@ -125,7 +112,7 @@ class ReadHolding(ModbusRequest[R]):
         if unit == BROADCAST or not 1 <= count <= MAX_READ:
             raise ValueError(f"a read asks one unit for 1 to {MAX_READ} registers, found unit {unit}, {count} registers")
         size = 2 * count
-        super().__init__(timing, unit, Function.READ_HOLDING, pack((address, count)), bytes((size,)), REPLY_OVERHEAD + size)
+        super().__init__(timing, unit, Function.READ_HOLDING, pack((address, count)), bytes((size,)), codec.REPLY_OVERHEAD + size)
         self.address = address
         self.count = count
         self.make = make
@@ -134,7 +121,7 @@ class ReadHolding(ModbusRequest[R]):
         return reply.function == self.function and reply.data[:1] == self.repeated and len(reply.data) == 2 * self.count + 1
 
     def value(self, data: bytes) -> R:
-        return self.make(unpack(data[1:]))
+        return self.make(codec.unpack(data[1:]))
 
 
 class PresenceRead(ReadHolding[R | None]):
@@ -195,7 +182,7 @@ class WriteMultiple(Write):
         if not 1 <= count <= MAX_WRITE:
             raise ValueError(f"a write carries 1 to {MAX_WRITE} registers, found {count}")
         span = pack((address, count))
-        super().__init__(timing, unit, Function.WRITE_MULTIPLE, span + bytes((2 * count,)) + pack(values), span, READ_SIZE)
+        super().__init__(timing, unit, Function.WRITE_MULTIPLE, span + bytes((2 * count,)) + pack(values), span, WRITE_SIZE)
         self.idempotent = repeat
         self.address = address
         self.count = count

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from servobus.errors import LimitError, NotSupported
-from servobus.protocols.roh.model import FULL, RohModel, RohRegister
-from servobus.protocols.roh.model_loading import channel_number
+from servobus.protocols.roh.model import CHANNELS, FULL, RohModel, RohRegister
 from servobus.protocols.roh.options import RohServo
 from servobus.protocols.roh.spans import Span
 from servobus.protocols.speed import goal_speed
@@ -68,7 +67,7 @@ class Finger:
         """`model`: any map, for its units."""
         self.name = name
         self.node = options.id
-        self.channel = channel_number(options)
+        self.channel = CHANNELS.index(options.channel)
         self.options = options
         self.unit = options.unit or "%"
         self.calibration = options.calibration(model)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from servobus.errors import ConfigError
 from servobus.protocols.model_files import ModelFiles
-from servobus.protocols.roh.model import CHANNELS, RohModel
+from servobus.protocols.roh.model import RohModel
 from servobus.protocols.roh.options import MAPS, RohBus, RohServo
 
 FILES = ModelFiles(RohModel, Path(__file__).parent / "models")
@@ -39,8 +39,3 @@ def _check_angles(name: str, servo: RohServo, model: RohModel) -> None:
     for value in (*(servo.limits or ()), servo.park_pose):
         if value is not None and not low - 1e-9 <= value <= high + 1e-9:
             raise ConfigError(f"servo {name}: {value:g} deg is outside {low:g} to {high:g}, the range of {servo.channel}")
-
-
-def channel_number(servo: RohServo) -> int:
-    """Return the finger's number on the wire."""
-    return CHANNELS.index(servo.channel)

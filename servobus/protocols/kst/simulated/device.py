@@ -13,20 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 from servobus.protocols.base import DeviceReply
-from servobus.protocols.kst.codec import (
-    BAUD_TABLE,
-    BROADCAST,
-    FACTORY_ID,
-    REFUSED,
-    REPLY,
-    SAVE_DATA,
-    VERSION,
-    Command,
-    Frame,
-    decode_position,
-    encode,
-    encode_position,
-)
+from servobus.protocols.kst import codec
+from servobus.protocols.kst.codec import BAUD_TABLE, BROADCAST, FACTORY_ID, REFUSED, REPLY, VERSION, Command, Frame, encode
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
 
@@ -130,7 +118,7 @@ class KstDevice:
         return data[:1]
 
     def save(self, data: bytes) -> Answer:
-        if data[: len(SAVE_DATA)] != SAVE_DATA:
+        if data[: len(codec.SAVE_DATA)] != codec.SAVE_DATA:
             return None
         self._stored = self._new
         return b"" if self.answers_save else None
@@ -139,14 +127,14 @@ class KstDevice:
         return bytes((self.node,))
 
     def set_position(self, data: bytes) -> Answer:
-        steps = decode_position(data)
+        steps = codec.decode_position(data)
         if not self.model.range[0] <= steps <= self.model.range[1]:
             return OUT_OF_RANGE
         self.goal = float(steps)
         return data[:2]
 
     def read_position(self, data: bytes) -> Answer:
-        return encode_position(round(self.goal if self.reads_goal else self.position))
+        return codec.encode_position(round(self.goal if self.reads_goal else self.position))
 
     def read_status(self, data: bytes) -> Answer:
         return self.status_bytes

@@ -139,30 +139,22 @@ def _result_key(command: str) -> str:
     return "write_state" if command.startswith("write") else "read_state" if command.startswith("read") else "set_state"
 
 
-_six: list[int] = [0] * JOINTS
+SIX: list[int] = [0] * JOINTS
+STATES: dict[str, dict[str, Any]] = {
+    "arm_current_trajectory": {"type": "none", "data": SIX},
+    "current_work_frame": {"frame_name": "World", "pose": SIX},
+    "current_tool_frame": {"tool_name": "Arm_Tip", "pose": SIX, "payload": 0, "position": [0, 0, 0]},
+    "install_pose": {"pose": [0, 0, 0]},
+    "joint_min_pos": {"min_pos": [-178_000] * JOINTS},
+    "joint_max_pos": {"max_pos": [178_000] * JOINTS},
+    "joint_max_acc": {"joint_acc": [600_000] * JOINTS},
+    "joint_max_speed": {"joint_speed": [180_000] * JOINTS},
+}
+PUSH = {"cycle": 5, "enable": False, "ip": "127.0.0.1", "port": 8089}
+CUSTOM_PUSH = {"expand_state": False, "joint_speed": False, "lift_state": False}
 DESCRIPTION: dict[str, Message] = {
-    "get_realtime_push": {
-        "command": "get_realtime_push",
-        "cycle": 5,
-        "enable": False,
-        "ip": "127.0.0.1",
-        "port": 8089,
-        "custom": {"expand_state": False, "joint_speed": False, "lift_state": False},
-    },
-    "get_arm_current_trajectory": {"state": "arm_current_trajectory", "type": "none", "data": _six},
-    "get_current_work_frame": {"state": "current_work_frame", "frame_name": "World", "pose": _six},
-    "get_current_tool_frame": {
-        "state": "current_tool_frame",
-        "tool_name": "Arm_Tip",
-        "pose": _six,
-        "payload": 0,
-        "position": [0, 0, 0],
-    },
-    "get_install_pose": {"state": "install_pose", "pose": [0, 0, 0]},
-    "get_joint_min_pos": {"state": "joint_min_pos", "min_pos": [-178_000] * JOINTS},
-    "get_joint_max_pos": {"state": "joint_max_pos", "max_pos": [178_000] * JOINTS},
-    "get_joint_max_acc": {"state": "joint_max_acc", "joint_acc": [600_000] * JOINTS},
-    "get_joint_max_speed": {"state": "joint_max_speed", "joint_speed": [180_000] * JOINTS},
+    "get_realtime_push": {"command": "get_realtime_push", **PUSH, "custom": CUSTOM_PUSH},
+    **{f"get_{state}": {"state": state, **fields} for state, fields in STATES.items()},
     "get_DH_data": {"command": "get_DH_data", **{f"joint_{number}": [0, 0, 0, 0] for number in range(1, JOINTS + 1)}},
 }
 """Command -> reply, for what the vendor's client asks when it connects."""

@@ -120,9 +120,13 @@ class SimulatedHand:
             raise Refusal(DEVICE_FAILURE, INVALID)
         self.written.append((address, word))
         self._memory[address] = word
-        effect = EFFECTS.get(register.name)
-        if effect is not None and channel < len(self.fingers):
-            effect(self, channel, raw)
+        if channel >= len(self.fingers):
+            return
+        if register.name in FINGER_SETTINGS:
+            attribute, convert = FINGER_SETTINGS[register.name]
+            setattr(self.fingers[channel], attribute, convert(raw))
+        elif register.name in EFFECTS:
+            EFFECTS[register.name](self, channel, raw)
 
     def _require_ready(self) -> None:
         if self.state in ("wait", "init"):
@@ -152,21 +156,6 @@ class SimulatedHand:
     def _angle(self, channel: int, position: float) -> int:
         open_, closed = self._ends(channel)
         return round(open_ + (closed - open_) * position / FULL)
-
-    def _set_speed(self, channel: int, raw: int) -> None:
-        self.fingers[channel].speed = raw
-
-    def _limit_current(self, channel: int, raw: int) -> None:
-        self.fingers[channel].current_limit = raw
-
-    def _limit_force(self, channel: int, raw: int) -> None:
-        self.fingers[channel].force_limit = raw
-
-    def _aim_force(self, channel: int, raw: int) -> None:
-        self.fingers[channel].force_limit = raw or None
-
-    def _stop_after(self, channel: int, raw: int) -> None:
-        self.fingers[channel].stop_after = raw / 1000
 
     def _beep(self, channel: int, raw: int) -> None:
         if self.peek("beep_switch"):
@@ -215,14 +204,17 @@ LIVE: dict[str, Callable[[SimulatedHand, int], int]] = {
     "current": lambda hand, channel: hand.fingers[channel].current,
     "force": lambda hand, channel: hand.fingers[channel].force,
 }
+FINGER_SETTINGS: dict[str, tuple[str, Callable[[int], float | None]]] = {
+    "speed": ("speed", int),
+    "current_limit": ("current_limit", int),
+    "force_limit": ("force_limit", int),
+    "force_target": ("force_limit", lambda raw: raw or None),
+    "stop_after_period": ("stop_after", lambda raw: raw / 1000),
+}
+"""Register -> attribute of the finger that a write sets, and its value."""
 EFFECTS: dict[str, Callable[[SimulatedHand, int, int], None]] = {
     "pos_target": SimulatedHand._aim,
     "angle_target": SimulatedHand._aim_angle,
-    "speed": SimulatedHand._set_speed,
-    "current_limit": SimulatedHand._limit_current,
-    "force_limit": SimulatedHand._limit_force,
-    "force_target": SimulatedHand._aim_force,
-    "stop_after_period": SimulatedHand._stop_after,
     "beep_period": SimulatedHand._beep,
     "reset": SimulatedHand._restart,
     "node_id": SimulatedHand._move_to_unit,
