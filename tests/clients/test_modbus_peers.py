@@ -31,7 +31,7 @@ buses:
     baudrate: 115200
     servos: {index: {id: 2, channel: index}}
 """
-TARGET, PLACE, SPEED, READ_ONLY, NOWHERE = 1136, 1146, 1126, 1001, 1990
+TARGET, POSITION, SPEED, READ_ONLY, NOWHERE = 1136, 1146, 1126, 1001, 1990
 
 
 @pytest.fixture
@@ -51,8 +51,8 @@ def test_mbpoll(port: str) -> None:
     assert "[1000]: \t512" in mbpoll(port, "-r", "1000", port).stdout
     assert mbpoll(port, "-r", str(SPEED), port, "40000").returncode == 0
     assert mbpoll(port, "-r", "1185", port, "20", "21", "22").returncode == 0
-    told = mbpoll(port, "-r", "1185", "-c", "3", port).stdout
-    assert [f"[{1185 + at}]: \t{20 + at}" in told for at in range(3)] == [True] * 3
+    output = mbpoll(port, "-r", "1185", "-c", "3", port).stdout
+    assert [f"[{1185 + at}]: \t{20 + at}" in output for at in range(3)] == [True] * 3
     assert "Illegal data address" in mbpoll(port, "-r", str(NOWHERE), port).stderr
     assert "Illegal data address" in mbpoll(port, "-r", str(READ_ONLY), port, "1").stderr
 
@@ -67,8 +67,8 @@ def test_pymodbus_is_served(port: str) -> None:
         assert client.read_holding_registers(SPEED, count=1, device_id=2).registers == [60000]
         assert client.read_holding_registers(NOWHERE, count=1, device_id=2).exception_code == 2
         assert client.write_registers(READ_ONLY, [1], device_id=2).exception_code == 2
-        places = (client.read_holding_registers(PLACE, count=1, device_id=2).registers[0] for _ in range(2000))
-        assert any(place == 65535 for place in places), "the finger has closed"
+        positions = (client.read_holding_registers(POSITION, count=1, device_id=2).registers[0] for _ in range(2000))
+        assert any(position == 65535 for position in positions), "the finger has closed"
     finally:
         client.close()
 
@@ -81,19 +81,19 @@ async def pymodbus_hand() -> AsyncIterator[int]:
     device = SimDevice(2, simdata=[SimData(0, values=registers, datatype=DataType.REGISTERS)])
     server = ModbusTcpServer(device, framer=FramerType.RTU, address=("127.0.0.1", 0))
     await server.listen()
-    listening: Any = server
+    endpoint: Any = server
     try:
-        yield listening.transport.sockets[0].getsockname()[1]
+        yield endpoint.transport.sockets[0].getsockname()[1]
     finally:
-        await listening.shutdown()
+        await endpoint.shutdown()
 
 
 async def test_pymodbus_as_the_hand() -> None:
     async with pymodbus_hand() as port:
         text = HAND.replace('"sim:"', f"tcp://127.0.0.1:{port}").replace("index: {id", "index: {limits: [0, 90], id")
         async with open_rig(parse_config(text, "peer")) as rig:
-            found = await rig.identify("index")
-            assert (found.model, found.firmware) == ("v2", "3.1.7")
+            identity = await rig.identify("index")
+            assert (identity.model, identity.firmware) == ("v2", "3.1.7")
             await rig.enable()
             assert await rig["index"].move_to(60) is Outcome.ACKED
             assert await rig.read_register("index", f"{TARGET}:1") == [round(0.6 * 65535)]

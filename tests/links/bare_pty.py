@@ -23,20 +23,20 @@ class Pty:
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self.slave)
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """When this returns the bytes can be read at the other side."""
         assert os.write(self._master, data) == len(data)
         assert select.select([self.slave], [], [], PATIENCE)[0]
 
-    async def hear(self, size: int) -> bytes:
+    async def receive(self, size: int) -> bytes:
         """So many bytes."""
-        heard = b""
-        while len(heard) < size:
+        received = b""
+        while len(received) < size:
             await self._readable()
-            heard += os.read(self._master, size - len(heard))
-        return heard
+            received += os.read(self._master, size - len(received))
+        return received
 
-    def heard(self) -> bytes:
+    def received(self) -> bytes:
         """What has come and was not heard yet."""
         try:
             return os.read(self._master, 100_000)

@@ -26,7 +26,7 @@ def on_each_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[str
     return run
 
 
-class Ear(asyncio.Protocol):
+class Receiver(asyncio.Protocol):
     """Keeps what it is told, in order."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Ear(asyncio.Protocol):
         self._news = asyncio.Event()
 
     @property
-    def heard(self) -> bytes:
+    def received(self) -> bytes:
         return b"".join(self.pieces)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -53,8 +53,8 @@ class Ear(asyncio.Protocol):
 
     async def until(self, size: int) -> bytes:
         """What was heard, when it is that many bytes."""
-        await self._until(lambda: len(self.heard) >= size)
-        return self.heard
+        await self._until(lambda: len(self.received) >= size)
+        return self.received
 
     async def gone(self) -> Exception | None:
         """With what the line was lost; and that it was lost once."""

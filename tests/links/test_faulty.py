@@ -18,36 +18,36 @@ FRAME = b"\x01abcdefgh"
 RUNS = 200
 
 
-class Parrot:
+class EchoEnd:
     """A far end whose first byte of a frame is the node. It answers what it is told, one pass of the loop later."""
 
     def __init__(self) -> None:
-        self.heard: list[bytes | int] = []
-        self.say: Callable[[bytes], None] = self.heard.append
+        self.received: list[bytes | int] = []
+        self.send: Callable[[bytes], None] = self.received.append
 
     def attach(self, deliver: Callable[[bytes], None]) -> None:
-        self.say = deliver
+        self.send = deliver
 
     def receive(self, data: bytes) -> None:
-        self.heard.append(data)
-        asyncio.get_running_loop().call_soon(self.say, data)
+        self.received.append(data)
+        asyncio.get_running_loop().call_soon(self.send, data)
 
     def set_baudrate(self, baudrate: int) -> None:
-        self.heard.append(baudrate)
+        self.received.append(baudrate)
 
 
 def rename(frame: bytes, rng: random.Random) -> bytes:
     return bytes((frame[0] + rng.randint(1, 9),)) + frame[1:]
 
 
-def faulty(**faults: Any) -> tuple[Parrot, FaultyEnd, list[bytes]]:
+def faulty(**faults: Any) -> tuple[EchoEnd, FaultyEnd, list[bytes]]:
     """A far end, what stands before it, and what is heard."""
-    parrot, heard = Parrot(), list[bytes]()
+    far, received = EchoEnd(), list[bytes]()
     end = FaultyEnd(
-        parrot, FaultOptions(**faults), asyncio.get_running_loop(), rename=rename, node_of=lambda frame: frame[0] if frame else 0
+        far, FaultOptions(**faults), asyncio.get_running_loop(), rename=rename, node_of=lambda frame: frame[0] if frame else 0
     )
-    end.attach(heard.append)
-    return parrot, end, heard
+    end.attach(received.append)
+    return far, end, received
 
 
 async def passes(count: int = 5) -> None:
@@ -57,22 +57,22 @@ async def passes(count: int = 5) -> None:
 
 async def struck(fault: str) -> list[bytes]:
     """What is left of RUNS frames, each struck."""
-    parrot, end, heard = faulty(**{fault: 1.0})
+    far, end, received = faulty(**{fault: 1.0})
     for _ in range(RUNS):
-        parrot.say(FRAME)
+        far.send(FRAME)
     await passes(RUNS + 5)
     assert end.counts[fault] == RUNS
-    return heard
+    return received
 
 
 @virtual
 async def test_without_faults_nothing_is_changed() -> None:
-    parrot, end, heard = faulty()
+    far, end, received = faulty()
     end.receive(b"\x01question")
     end.set_baudrate(9_600)
     await passes()
-    assert parrot.heard == [b"\x01question", 9_600]
-    assert heard == [b"\x01question"]
+    assert far.received == [b"\x01question", 9_600]
+    assert received == [b"\x01question"]
     assert end.counts.total() == 0
 
 
@@ -101,17 +101,17 @@ async def test_drop_byte() -> None:
 
 @virtual
 async def test_insert_byte() -> None:
-    for heard in await struck("insert_byte"):
-        assert len(heard) == len(FRAME) + 1
-        assert FRAME in {heard[:at] + heard[at + 1 :] for at in range(len(heard))}
+    for received in await struck("insert_byte"):
+        assert len(received) == len(FRAME) + 1
+        assert FRAME in {received[:at] + received[at + 1 :] for at in range(len(received))}
 
 
 @virtual
 async def test_flip() -> None:
     """One byte, never to itself; every place is struck."""
     places = Counter[int]()
-    for heard in await struck("flip"):
-        (at,) = [at for at, (was, now) in enumerate(zip(FRAME, heard, strict=True)) if was != now]
+    for received in await struck("flip"):
+        (at,) = [at for at, (was, now) in enumerate(zip(FRAME, received, strict=True)) if was != now]
         places[at] += 1
     assert len(places) == len(FRAME)
 
@@ -119,9 +119,9 @@ async def test_flip() -> None:
 @virtual
 async def test_wrong_id() -> None:
     """In another's name, by the caller's rule."""
-    for heard in await struck("wrong_id"):
-        assert heard[0] != FRAME[0]
-        assert heard[1:] == FRAME[1:]
+    for received in await struck("wrong_id"):
+        assert received[0] != FRAME[0]
+        assert received[1:] == FRAME[1:]
 
 
 @virtual
@@ -132,93 +132,93 @@ async def test_noise() -> None:
 @virtual
 async def test_echo() -> None:
     """Before the answer, and the far end hears the question once."""
-    parrot, end, heard = faulty(echo=1.0)
+    far, end, received = faulty(echo=1.0)
     end.receive(b"\x01question")
-    assert heard == []
+    assert received == []
     await passes()
-    assert parrot.heard == [b"\x01question"]
-    assert heard == [b"\x01question", b"\x01question"]
+    assert far.received == [b"\x01question"]
+    assert received == [b"\x01question", b"\x01question"]
     assert end.counts["echo"] == 1
 
 
 @virtual
 async def test_late() -> None:
     """Up to `delay_ms`; a node and its UART are a queue, and other nodes do not wait for it."""
-    parrot, end, heard = faulty(late=0.1, delay_ms=20)
-    said = [bytes((node, count)) for count in range(250) for node in (1, 2)]
-    for frame in said:
-        parrot.say(frame)
+    far, end, received = faulty(late=0.1, delay_ms=20)
+    sent = [bytes((node, count)) for count in range(250) for node in (1, 2)]
+    for frame in sent:
+        far.send(frame)
         await asyncio.sleep(0.002)
     await asyncio.sleep(0.02)
     assert end.counts["late"] > 10
-    assert sorted(heard) == sorted(said)
-    assert heard != said
+    assert sorted(received) == sorted(sent)
+    assert received != sent
     for node in (1, 2):
-        assert [frame for frame in heard if frame[0] == node] == [frame for frame in said if frame[0] == node]
+        assert [frame for frame in received if frame[0] == node] == [frame for frame in sent if frame[0] == node]
 
 
 @virtual
 async def test_many_behind_one_late_answer_keep_their_order() -> None:
     """They all come at the same moment."""
-    parrot, end, heard = faulty(late=0.5, delay_ms=100, seed=3)
-    said = [bytes((1, count)) for count in range(200)]
-    for frame in said:
-        parrot.say(frame)
-    await passes(len(said))
-    assert len(heard) < len(said)
+    far, end, received = faulty(late=0.5, delay_ms=100, seed=3)
+    sent = [bytes((1, count)) for count in range(200)]
+    for frame in sent:
+        far.send(frame)
+    await passes(len(sent))
+    assert len(received) < len(sent)
     await asyncio.sleep(0.1)
-    await passes(len(said))
-    assert heard == said
+    await passes(len(sent))
+    assert received == sent
     assert 50 < end.counts["late"] < 150
 
 
 @virtual
 async def test_a_late_answer_is_out_of_the_way_when_its_time_has_come() -> None:
-    parrot, _, heard = faulty(late=1.0, delay_ms=10)
-    parrot.say(b"\x01first")
+    far, _, received = faulty(late=1.0, delay_ms=10)
+    far.send(b"\x01first")
     await passes()
-    assert heard == []
+    assert received == []
     await asyncio.sleep(0.01)
     await passes()
-    assert heard == [b"\x01first"]
+    assert received == [b"\x01first"]
 
 
 @pytest.mark.parametrize(("chop", "longest"), [("bytes", 1), ("random", MAX_PIECE)])
 @virtual
 async def test_pieces(chop: str, longest: int) -> None:
     """One in each pass of the loop, nothing lost, nothing overtaken."""
-    parrot, end, heard = faulty(chop=chop)
+    far, end, received = faulty(chop=chop)
     end.receive(b"\x01" + bytes(range(100)))
     await passes(3)
-    parrot.say(b"\x01behind")
-    early = len(heard)
+    far.send(b"\x01behind")
+    early = len(received)
     await passes(1)
-    assert len(heard) == early + 1
+    assert len(received) == early + 1
     await passes(200)
-    assert b"".join(heard) == b"\x01" + bytes(range(100)) + b"\x01behind"
-    assert {len(piece) for piece in heard} <= set(range(1, longest + 1))
-    assert max(len(piece) for piece in heard) == longest
+    assert b"".join(received) == b"\x01" + bytes(range(100)) + b"\x01behind"
+    assert {len(piece) for piece in received} <= set(range(1, longest + 1))
+    assert max(len(piece) for piece in received) == longest
 
 
 @virtual
 async def test_whole_frames_stay_apart() -> None:
-    parrot, _, heard = faulty(chop="whole")
+    far, _, received = faulty(chop="whole")
     for frame in (b"\x01one", b"\x01two", b"\x01three"):
-        parrot.say(frame)
+        far.send(frame)
     await passes()
-    assert heard == [b"\x01one", b"\x01two", b"\x01three"]
+    assert received == [b"\x01one", b"\x01two", b"\x01three"]
 
 
 async def mixed(seed: int) -> tuple[list[bytes], Counter[str]]:
     every = dict.fromkeys(
         ("loss", "late", "duplicate", "truncate", "drop_byte", "insert_byte", "flip", "wrong_id", "noise", "echo"), 0.2
     )
-    _, end, heard = faulty(**every, delay_ms=5, chop="random", seed=seed)
+    _, end, received = faulty(**every, delay_ms=5, chop="random", seed=seed)
     for count in range(100):
         end.receive(bytes((count % 3,)) + FRAME)
         await asyncio.sleep(0.001)
     await asyncio.sleep(1)
-    return heard, end.counts
+    return received, end.counts
 
 
 def test_a_run_can_be_had_again() -> None:

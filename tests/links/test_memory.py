@@ -10,7 +10,7 @@ import pytest
 from servobus.errors import LinkDown, PortBusy, PortMissing
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
-from tests.links.recorder import Ear
+from tests.links.recorder import Receiver
 from tests.virtual_time import virtual
 
 TRAITS = LineTraits(9_600, can_change_baud=True)
@@ -20,63 +20,63 @@ class Far:
     """A far end that keeps what it is told and says what the test says."""
 
     def __init__(self) -> None:
-        self.heard: list[bytes | int] = []
-        self.say: Callable[[bytes], None] = self.heard.append
+        self.received: list[bytes | int] = []
+        self.send: Callable[[bytes], None] = self.received.append
 
     def attach(self, deliver: Callable[[bytes], None]) -> None:
-        self.say = deliver
+        self.send = deliver
 
     def receive(self, data: bytes) -> None:
-        self.heard.append(data)
+        self.received.append(data)
 
     def set_baudrate(self, baudrate: int) -> None:
-        self.heard.append(baudrate)
+        self.received.append(baudrate)
 
 
 @virtual
 async def test_both_ways() -> None:
-    far, ear = Far(), Ear()
+    far, receiver = Far(), Receiver()
     link = MemoryLink(far, TRAITS)
-    transport = await link.connect(ear)
+    transport = await link.connect(receiver)
     transport.write(b"question")
     transport.set_baudrate(115_200)
-    far.say(b"answer")
+    far.send(b"answer")
     assert (link.traits, link.address) == (TRAITS, "sim:")
-    assert far.heard == [b"question", 115_200]
-    assert (ear.made, ear.pieces) == (1, [b"answer"])
+    assert far.received == [b"question", 115_200]
+    assert (receiver.made, receiver.pieces) == (1, [b"answer"])
     assert not transport.poll_input()
 
 
 @virtual
 async def test_nobody_hears_a_line_that_is_not_open() -> None:
-    far, ear = Far(), Ear()
+    far, receiver = Far(), Receiver()
     link = MemoryLink(far, TRAITS)
-    far.say(b"before")
-    transport = await link.connect(ear)
+    far.send(b"before")
+    transport = await link.connect(receiver)
     transport.close()
-    far.say(b"after")
+    far.send(b"after")
     transport.write(b"after")
-    assert await ear.gone() is None
-    assert (ear.pieces, far.heard) == ([], [])
+    assert await receiver.gone() is None
+    assert (receiver.pieces, far.received) == ([], [])
 
 
 @virtual
-async def test_lost_is_said_once_and_never_from_within_a_call() -> None:
-    ear = Ear()
+async def test_the_end_is_reported_once_and_not_from_within_a_call() -> None:
+    receiver = Receiver()
     link = MemoryLink(Far(), TRAITS)
-    transport = await link.connect(ear)
+    transport = await link.connect(receiver)
     transport.close()
     transport.abort()
     link.unplug()
     assert transport.is_closing()
-    assert ear.lost == []
-    assert await ear.gone() is None
+    assert receiver.lost == []
+    assert await receiver.gone() is None
 
 
 @virtual
 async def test_one_user_at_a_time() -> None:
     link = MemoryLink(Far(), TRAITS, "sim:arm")
-    first, second = Ear(), Ear()
+    first, second = Receiver(), Receiver()
     transport = await link.connect(first)
     with pytest.raises(PortBusy, match=r"sim:arm is open already.*close it first"):
         await link.connect(second)
@@ -88,7 +88,7 @@ async def test_one_user_at_a_time() -> None:
 @virtual
 async def test_of_two_at_the_same_time_one_is_busy() -> None:
     link = MemoryLink(Far(), TRAITS)
-    results = await asyncio.gather(link.connect(Ear()), link.connect(Ear()), return_exceptions=True)
+    results = await asyncio.gather(link.connect(Receiver()), link.connect(Receiver()), return_exceptions=True)
     assert [type(result).__name__ for result in results] == ["MemoryTransport", "PortBusy"]
 
 
@@ -96,7 +96,7 @@ async def test_of_two_at_the_same_time_one_is_busy() -> None:
 async def test_who_reconnects_hears_of_the_loss_first() -> None:
     """One protocol for both connections, as a bus does it: the end of the old one must not look like the end of the new one."""
 
-    class Diary(Ear):
+    class Diary(Receiver):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             entries.append("made")
 
@@ -112,20 +112,20 @@ async def test_who_reconnects_hears_of_the_loss_first() -> None:
 
 @virtual
 async def test_the_plug() -> None:
-    far, ear, again = Far(), Ear(), Ear()
+    far, receiver, again = Far(), Receiver(), Receiver()
     link = MemoryLink(far, TRAITS)
-    transport = await link.connect(ear)
+    transport = await link.connect(receiver)
     link.unplug()
     transport.write(b"into the void")
-    error = await ear.gone()
+    error = await receiver.gone()
     assert isinstance(error, LinkDown)
     assert "plug it in again" in str(error)
     with pytest.raises(PortMissing, match="plug it in"):
         await link.connect(again)
     link.plug()
     (await link.connect(again)).write(b"back")
-    far.say(b"hello")
-    assert (far.heard, again.heard, ear.heard) == ([b"back"], b"hello", b"")
+    far.send(b"hello")
+    assert (far.received, again.received, receiver.received) == ([b"back"], b"hello", b"")
 
 
 @virtual
@@ -133,6 +133,6 @@ async def test_a_plug_that_nobody_uses() -> None:
     link = MemoryLink(Far(), TRAITS)
     link.unplug()
     link.plug()
-    ear = Ear()
-    await link.connect(ear)
-    assert (ear.made, ear.lost) == (1, [])
+    receiver = Receiver()
+    await link.connect(receiver)
+    assert (receiver.made, receiver.lost) == (1, [])

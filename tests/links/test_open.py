@@ -62,6 +62,6 @@ def test_unknown_schemes(port: str) -> None:
         open_link(port, 9_600)
 
 
-def test_schemes_are_lower_case_words() -> None:
+def test_schemes_are_lower_case() -> None:
     """A config is read by people: one spelling."""
     assert all(scheme.isalpha() and scheme.islower() and form.startswith(f"{scheme}://") for scheme, (_, form) in SCHEMES.items())

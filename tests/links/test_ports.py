@@ -28,15 +28,15 @@ def test_without_udev_there_are_no_links(tmp_path: Path) -> None:
     assert links_in(tmp_path / "by-id") == {}
 
 
-def test_all_that_is_known_of_a_port() -> None:
+def test_a_port_is_described() -> None:
     with plugged() as pty:
-        found = ListPortInfo(pty.path)
-        found.description, found.manufacturer, found.serial_number = "USB Serial", "1a86", "A50285BI"
-        found.vid, found.pid = 0x1A86, 0x7523
-        told = describe(found, {pty.path: "/by-id/usb"}, {"/dev/other": "/by-path/other", pty.path: "/by-path/1.2"})
+        port = ListPortInfo(pty.path)
+        port.description, port.manufacturer, port.serial_number = "USB Serial", "1a86", "A50285BI"
+        port.vid, port.pid = 0x1A86, 0x7523
+        info = describe(port, {pty.path: "/by-id/usb"}, {"/dev/other": "/by-path/other", pty.path: "/by-path/1.2"})
         name = Path("/proc/self/comm").read_text().strip()
         holder = (os.getpid(), name)
-    assert told == PortInfo(pty.path, "/by-id/usb", "/by-path/1.2", "USB Serial", "1a86", "A50285BI", 0x1A86, 0x7523, holder)
+    assert info == PortInfo(pty.path, "/by-id/usb", "/by-path/1.2", "USB Serial", "1a86", "A50285BI", 0x1A86, 0x7523, holder)
 
 
 def test_what_nobody_knows_is_none(tmp_path: Path) -> None:

@@ -139,7 +139,7 @@ async def test_an_arm_that_falls_silent_or_hangs_up_is_called_again(faults: ArmF
             assert await rig.read_register("index", "stall_speed") == 100 + number
 
 
-async def test_what_was_under_way_fails_when_the_arm_is_gone_and_goes_on_when_it_is_back() -> None:
+async def test_a_read_fails_while_the_arm_is_gone_and_works_again_later() -> None:
     async with behind() as (rig, hand, server):
         hand.extra_delay = 0.5
         reading = asyncio.create_task(rig.read_register("index", "stall_speed"))

@@ -16,31 +16,31 @@ from servobus.errors import LinkDown
 from servobus.links.serial import MAX_UNSENT, UART_LATENCY, USB_LATENCY, SerialLink
 from servobus.protocols.base import LineTraits
 from tests.links.bare_pty import plugged
-from tests.links.recorder import Ear, on_each_loop
+from tests.links.recorder import Receiver, on_each_loop
 
 ODD_RATES = (76_800, 128_000, 250_000, 256_000, 512_000)
 
 
 @on_each_loop
 async def test_both_ways() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 1_000_000).connect(ear)
-        assert ear.made == 1
+        transport = await SerialLink(pty.path, 1_000_000).connect(receiver)
+        assert receiver.made == 1
         every = bytes(range(256))  # none means anything to the terminal
         transport.write(every)
-        assert await pty.hear(256) == every
-        pty.say(every)
-        assert await ear.until(256) == every
+        assert await pty.receive(256) == every
+        pty.send(every)
+        assert await receiver.until(256) == every
         transport.abort()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 @pytest.mark.parametrize("baudrate", [9_600, 115_200, 1_000_000, *ODD_RATES])
 async def test_any_rate(baudrate: int) -> None:
     """At open, and changed to while open, from a rate that is custom as well."""
     with plugged() as pty:
-        transport = await SerialLink(pty.path, baudrate).connect(Ear())
+        transport = await SerialLink(pty.path, baudrate).connect(Receiver())
         assert pty.baudrate() == baudrate
         for rate in (333_333, baudrate):
             transport.set_baudrate(rate)
@@ -48,95 +48,95 @@ async def test_any_rate(baudrate: int) -> None:
         transport.abort()
 
 
-async def test_the_rate_changes_when_everything_was_said() -> None:
+async def test_the_rate_changes_when_everything_is_sent() -> None:
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 9_600).connect(Ear())
+        transport = await SerialLink(pty.path, 9_600).connect(Receiver())
         transport.write(b"at the old rate")
         transport.set_baudrate(115_200)
         transport.set_baudrate(57_600)  # the last one counts
         transport.write(b"at the ")
         transport.write(b"new rate")
-        assert await pty.hear(30) == b"at the old rateat the new rate"
+        assert await pty.receive(30) == b"at the old rateat the new rate"
         assert pty.baudrate() == 57_600
         transport.abort()
 
 
 async def test_until_then_the_rate_is_the_old_one() -> None:
     """Ten seconds' worth of bytes, which nobody waits for."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 300).connect(ear)
+        transport = await SerialLink(pty.path, 300).connect(receiver)
         transport.write(bytes(300))
         transport.set_baudrate(115_200)
         transport.write(b"later")
         assert transport.get_write_buffer_size() == 5
-        assert await pty.hear(300) == bytes(300)
-        assert (pty.baudrate(), pty.heard()) == (300, b"")
+        assert await pty.receive(300) == bytes(300)
+        assert (pty.baudrate(), pty.received()) == (300, b"")
         transport.abort()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 async def test_bytes_that_wait_for_a_rate_are_bounded() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 300).connect(ear)
+        transport = await SerialLink(pty.path, 300).connect(receiver)
         transport.write(bytes(300))
         transport.set_baudrate(115_200)
         transport.write(bytes(MAX_UNSENT))
         assert not transport.is_closing()
         transport.write(b"x")
-        assert "takes no more bytes" in str(await ear.gone())
+        assert "takes no more bytes" in str(await receiver.gone())
 
 
-async def test_who_closes_while_a_rate_changes_is_heard() -> None:
-    ear = Ear()
+async def test_a_close_during_a_change_of_rate_sends_everything() -> None:
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 9_600).connect(ear)
+        transport = await SerialLink(pty.path, 9_600).connect(receiver)
         transport.write(b"old")
         transport.set_baudrate(115_200)
         transport.write(b"new")
         transport.close()
-        assert await pty.hear(6) == b"oldnew"
-        assert await ear.gone() is None
+        assert await pty.receive(6) == b"oldnew"
+        assert await receiver.gone() is None
 
 
 async def test_looking_hands_over_what_is_there() -> None:
     """At once, without a pass of the loop; and finding nothing means nothing."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        transport = await SerialLink(pty.path, 115_200).connect(receiver)
         assert transport.poll_input()
-        pty.say(b"late")
-        assert ear.heard == b""
+        pty.send(b"late")
+        assert receiver.received == b""
         assert transport.poll_input()
-        assert ear.heard == b"late"
+        assert receiver.received == b"late"
         assert transport.poll_input()
-        assert (ear.pieces, ear.lost) == ([b"late"], [])
+        assert (receiver.pieces, receiver.lost) == ([b"late"], [])
         transport.abort()
-        pty.say(b"too late")
+        pty.send(b"too late")
         assert transport.poll_input()
-        assert await ear.gone() is None
-        assert ear.heard == b"late"
+        assert await receiver.gone() is None
+        assert receiver.received == b"late"
 
 
 async def test_what_came_before_is_thrown_away() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        pty.say(b"of yesterday")
-        transport = await SerialLink(pty.path, 115_200).connect(ear)
-        pty.say(b"today")
-        assert await ear.until(1) == b"today"
+        pty.send(b"of yesterday")
+        transport = await SerialLink(pty.path, 115_200).connect(receiver)
+        pty.send(b"today")
+        assert await receiver.until(1) == b"today"
         transport.abort()
 
 
 async def test_no_rs485_mode() -> None:
     """The message names the option; the port is left free."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
         with pytest.raises(LinkDown, match=r"no RS485 mode: take out `rs485: true`"):
-            await SerialLink(pty.path, 115_200, rs485=True).connect(ear)
+            await SerialLink(pty.path, 115_200, rs485=True).connect(receiver)
         fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        assert (ear.made, ear.lost) == (0, [])
+        assert (receiver.made, receiver.lost) == (0, [])
 
 
 @pytest.mark.parametrize("rs485", [False, True])
@@ -146,9 +146,9 @@ async def test_cancelled_while_it_opens(rs485: bool) -> None:
     problems: list[dict[str, Any]] = []
     loop.set_exception_handler(lambda loop, context: problems.append(context))
     loop.set_default_executor(ThreadPoolExecutor(1))
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        task = asyncio.create_task(SerialLink(pty.path, 115_200, rs485=rs485).connect(ear))
+        task = asyncio.create_task(SerialLink(pty.path, 115_200, rs485=rs485).connect(receiver))
         await asyncio.sleep(0)
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -156,21 +156,21 @@ async def test_cancelled_while_it_opens(rs485: bool) -> None:
         await loop.run_in_executor(None, int)  # behind the opening, in the only thread
         fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
     gc.collect()
-    assert (ear.made, problems) == (0, [])
+    assert (receiver.made, problems) == (0, [])
 
 
 async def test_cancelled_as_it_opened() -> None:
-    class Impatient(Ear):
+    class Impatient(Receiver):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             super().connection_made(transport)
             task.cancel()
 
-    ear = Impatient()
+    receiver = Impatient()
     with plugged() as pty:
-        task = asyncio.create_task(SerialLink(pty.path, 115_200).connect(ear))
+        task = asyncio.create_task(SerialLink(pty.path, 115_200).connect(receiver))
         with pytest.raises(asyncio.CancelledError):
             await task
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
         fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
@@ -201,11 +201,11 @@ async def test_the_line_is_raw() -> None:
         cooked[1] |= termios.OPOST | termios.ONLCR
         cooked[3] |= termios.ICANON | termios.ECHO | termios.ISIG
         termios.tcsetattr(pty.slave, termios.TCSANOW, cooked)
-        ear = Ear()
-        transport = await SerialLink(pty.path, 115_200).connect(ear)
-        pty.say(b"\r\n\x03\x11\x13\x04")
-        assert await ear.until(6) == b"\r\n\x03\x11\x13\x04"
+        receiver = Receiver()
+        transport = await SerialLink(pty.path, 115_200).connect(receiver)
+        pty.send(b"\r\n\x03\x11\x13\x04")
+        assert await receiver.until(6) == b"\r\n\x03\x11\x13\x04"
         transport.write(b"\r\n")
-        assert await pty.hear(2) == b"\r\n"
-        assert pty.heard() == b""
+        assert await pty.receive(2) == b"\r\n"
+        assert pty.received() == b""
         transport.abort()

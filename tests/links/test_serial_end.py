@@ -10,95 +10,95 @@ import pytest
 from servobus.errors import LinkDown
 from servobus.links.serial import MAX_UNSENT, DirectTransport, SerialLink
 from tests.links.bare_pty import Pty, plugged
-from tests.links.recorder import Ear, on_each_loop
+from tests.links.recorder import Receiver, on_each_loop
 
 
-async def filled(pty: Pty, ear: Ear) -> tuple[DirectTransport, bytes]:
+async def filled(pty: Pty, receiver: Receiver) -> tuple[DirectTransport, bytes]:
     """A transport whose kernel buffer is full, and all that it was given so far."""
-    transport = await SerialLink(pty.path, 1_000_000).connect(ear)
-    said = b""
+    transport = await SerialLink(pty.path, 1_000_000).connect(receiver)
+    sent = b""
     while not transport.get_write_buffer_size():
-        chunk = bytes(at & 0xFF for at in range(len(said), len(said) + 1021))
+        chunk = bytes(at & 0xFF for at in range(len(sent), len(sent) + 1021))
         transport.write(chunk)
-        said += chunk
-    return transport, said
+        sent += chunk
+    return transport, sent
 
 
 @on_each_loop
 async def test_what_finds_no_room_goes_later() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport, said = await filled(pty, ear)
+        transport, sent = await filled(pty, receiver)
         transport.write(b"the end")
-        assert await pty.hear(len(said) + 7) == said + b"the end"
+        assert await pty.receive(len(sent) + 7) == sent + b"the end"
         assert transport.get_write_buffer_size() == 0
         transport.write(b"at once")
-        assert await pty.hear(7) == b"at once"
+        assert await pty.receive(7) == b"at once"
         transport.abort()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 async def test_what_waits_for_room_is_bounded() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport, _ = await filled(pty, ear)
+        transport, _ = await filled(pty, receiver)
         transport.write(bytes(MAX_UNSENT - transport.get_write_buffer_size()))
         assert not transport.is_closing()
         transport.write(b"x")
         assert transport.is_closing()
-        error = await ear.gone()
+        error = await receiver.gone()
         assert isinstance(error, LinkDown)
         assert "takes no more bytes" in str(error)
 
 
 @on_each_loop
-async def test_who_closes_is_heard_to_the_end() -> None:
-    ear = Ear()
+async def test_a_close_sends_everything() -> None:
+    receiver = Receiver()
     with plugged() as pty:
-        transport, said = await filled(pty, ear)
+        transport, sent = await filled(pty, receiver)
         transport.close()
         transport.write(b"too late")
         assert transport.is_closing()
-        assert await pty.hear(len(said)) == said
-        assert await ear.gone() is None
-        assert pty.heard() == b""
+        assert await pty.receive(len(sent)) == sent
+        assert await receiver.gone() is None
+        assert pty.received() == b""
 
 
 @on_each_loop
 async def test_who_aborts_waits_for_nothing() -> None:
     """The other side takes nothing, and never will."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport, _ = await filled(pty, ear)
+        transport, _ = await filled(pty, receiver)
         transport.close()
         transport.abort()
         transport.abort()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
         transport.close()
         transport.abort()
         transport.set_baudrate(9_600)
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 @on_each_loop
 async def test_unplugged() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        transport = await SerialLink(pty.path, 115_200).connect(receiver)
         pty.unplug()
-        error = await ear.gone()
+        error = await receiver.gone()
         assert isinstance(error, LinkDown)
         assert str(error).startswith(f"{pty.path} was unplugged, or its other end closed: it is opened again when it is back")
         transport.write(b"nobody")
-        assert (transport.is_closing(), ear.lost) == (True, [error])
+        assert (transport.is_closing(), receiver.lost) == (True, [error])
 
 
 @pytest.mark.parametrize("verb", ["write", "poll_input", "set_baudrate"])
 async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
     """Reported once, though the loop finds it out as well; and not from within the call."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 115_200).connect(ear)
+        transport = await SerialLink(pty.path, 115_200).connect(receiver)
         pty.unplug()
         calls: dict[str, Callable[[], object]] = {
             "write": lambda: transport.write(b"x"),
@@ -106,37 +106,37 @@ async def test_unplugged_as_the_next_call_finds_out(verb: str) -> None:
             "set_baudrate": lambda: transport.set_baudrate(9_600),
         }
         calls[verb]()
-        assert (transport.is_closing(), ear.lost) == (True, [])
-        assert isinstance(await ear.gone(), LinkDown)
+        assert (transport.is_closing(), receiver.lost) == (True, [])
+        assert isinstance(await receiver.gone(), LinkDown)
 
 
 @on_each_loop
 async def test_unplugged_with_a_full_buffer() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        await filled(pty, ear)
+        await filled(pty, receiver)
         pty.unplug()
-        assert isinstance(await ear.gone(), LinkDown)
+        assert isinstance(await receiver.gone(), LinkDown)
 
 
 @on_each_loop
 async def test_unplugged_while_closing() -> None:
     """Whoever was leaving anyway has left."""
-    ear = Ear()
+    receiver = Receiver()
     with plugged() as pty:
-        transport, _ = await filled(pty, ear)
+        transport, _ = await filled(pty, receiver)
         transport.close()
         pty.unplug()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
-async def test_the_port_is_free_when_the_loss_was_told() -> None:
+async def test_the_port_is_free_when_the_loss_is_reported() -> None:
     """Also for the next user, who finds it open for everybody."""
     with plugged() as pty:
         for leave in ("close", "abort"):
-            ear = Ear()
-            transport = await SerialLink(pty.path, 115_200).connect(ear)
+            receiver = Receiver()
+            transport = await SerialLink(pty.path, 115_200).connect(receiver)
             getattr(transport, leave)()
-            assert await ear.gone() is None
+            assert await receiver.gone() is None
             fcntl.flock(pty.slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
             fcntl.flock(pty.slave, fcntl.LOCK_UN)

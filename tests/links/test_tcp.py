@@ -14,7 +14,7 @@ import pytest
 from servobus.errors import LinkDown
 from servobus.links.tcp import LATENCY, TcpLink, explain_connect_error
 from servobus.protocols.base import LineTraits
-from tests.links.recorder import PATIENCE, Ear, on_each_loop
+from tests.links.recorder import PATIENCE, Receiver, on_each_loop
 
 
 class Server:
@@ -51,70 +51,70 @@ async def serving() -> AsyncIterator[Server]:
 
 @on_each_loop
 async def test_both_ways() -> None:
-    ear = Ear()
+    receiver = Receiver()
     async with serving() as server:
-        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
-        assert ear.made == 1
+        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)
+        assert receiver.made == 1
         await server.connected()
         transport.write(b"question")
         assert await server.reader.readexactly(8) == b"question"
         server.writer.write(b"answer")
-        assert await ear.until(6) == b"answer"
+        assert await receiver.until(6) == b"answer"
         assert not transport.poll_input()
         transport.abort()
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 @on_each_loop
 async def test_the_server_closes() -> None:
-    ear = Ear()
+    receiver = Receiver()
     async with serving() as server:
-        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
+        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)
         await server.connected()
         server.writer.close()
-        error = await ear.gone()
+        error = await receiver.gone()
         assert isinstance(error, LinkDown)
         assert str(error) == f"tcp://127.0.0.1:{server.port} closed the connection: it is opened again"
         assert transport.is_closing()
         for _ in range(10):
             transport.write(b"nobody")
-        assert await ear.gone() is error
+        assert await receiver.gone() is error
 
 
 @on_each_loop
 async def test_the_connection_breaks() -> None:
     """A server that is reset says so with RST."""
-    ear = Ear()
+    receiver = Receiver()
     async with serving() as server:
-        await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
+        await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)
         await server.connected()
         server.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         server.writer.transport.abort()
-        error = await ear.gone()
+        error = await receiver.gone()
         assert isinstance(error, LinkDown)
         assert str(error).startswith(f"tcp://127.0.0.1:{server.port} was lost (")
         assert str(error).endswith("): it is opened again")
 
 
 @on_each_loop
-async def test_who_closes_is_heard_to_the_end() -> None:
-    ear, much = Ear(), bytes(30_000)
+async def test_a_close_sends_everything() -> None:
+    receiver, much = Receiver(), bytes(30_000)
     async with serving() as server:
-        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
+        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)
         await server.connected()
         transport.write(much)
         transport.close()
         transport.write(b"too late")
         assert await server.reader.read() == much
-        assert await ear.gone() is None
+        assert await receiver.gone() is None
 
 
 @on_each_loop
 async def test_what_waits_for_the_server_is_bounded() -> None:
     """It reads nothing: the connection is given up, however much the system itself is ready to keep."""
-    ear = Ear()
+    receiver = Receiver()
     async with serving() as server:
-        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(ear)
+        transport = await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)
         await server.connected()
         server.writer.transport.pause_reading()  # type: ignore[attr-defined]  # a stream's transport reads as well
         for _ in range(100_000):
@@ -122,20 +122,20 @@ async def test_what_waits_for_the_server_is_bounded() -> None:
             await asyncio.sleep(0)
             if transport.is_closing():
                 break
-        error = await ear.gone()
+        error = await receiver.gone()
         assert isinstance(error, LinkDown)
         assert "takes no more bytes: is the server alive?" in str(error)
 
 
 @on_each_loop
 async def test_nobody_listens() -> None:
-    ear = Ear()
+    receiver = Receiver()
     with socket.socket() as reserved:  # bound, but it does not listen
         reserved.bind(("127.0.0.1", 0))
         port = reserved.getsockname()[1]
         with pytest.raises(LinkDown, match=f"tcp://127.0.0.1:{port}: no program listens there: check the port number"):
-            await TcpLink("127.0.0.1", port, 115_200).connect(ear)
-    assert (ear.made, ear.lost) == (0, [])
+            await TcpLink("127.0.0.1", port, 115_200).connect(receiver)
+    assert (receiver.made, receiver.lost) == (0, [])
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from servobus.errors import LinkDown, PortBusy, PortDenied, PortMissing
 from servobus.links.serial import SerialLink
 from servobus.links.tty import check_device, explain_open_error, find_holder, is_pty
 from tests.links.bare_pty import plugged
-from tests.links.recorder import Ear
+from tests.links.recorder import Receiver
 
 HOLD = """
 import serial, sys
@@ -43,10 +43,10 @@ def held(path: str) -> Iterator[tuple[int, str]]:
 
 async def connecting(path: str) -> LinkDown:
     """What connecting says."""
-    ear = Ear()
+    receiver = Receiver()
     with pytest.raises(LinkDown) as caught:
-        await SerialLink(path, 115_200).connect(ear)
-    assert (ear.made, ear.lost) == (0, [])
+        await SerialLink(path, 115_200).connect(receiver)
+    assert (receiver.made, receiver.lost) == (0, [])
     return caught.value
 
 
@@ -103,12 +103,12 @@ async def test_busy() -> None:
             assert find_holder(pty.path) == (pid, name)
         assert isinstance(error, PortBusy)
         assert str(error) == f"{pty.path} is open in process {pid} ({name}): end that first, or use the port through it"
-        (await SerialLink(pty.path, 115_200).connect(Ear())).abort()
+        (await SerialLink(pty.path, 115_200).connect(Receiver())).abort()
 
 
 async def test_busy_here() -> None:
     with plugged() as pty:
-        transport = await SerialLink(pty.path, 115_200).connect(Ear())
+        transport = await SerialLink(pty.path, 115_200).connect(Receiver())
         error = await connecting(pty.path)
         transport.abort()
     assert isinstance(error, PortBusy)
@@ -116,7 +116,7 @@ async def test_busy_here() -> None:
     assert str(error).endswith("close it there first")
 
 
-def test_busy_and_nobody_to_be_seen(tmp_path: Path) -> None:
+def test_a_busy_port_without_a_visible_holder(tmp_path: Path) -> None:
     """Who may not look into another user's process is told how to."""
     error = explain_open_error(str(tmp_path), OSError(errno.EBUSY, "Device or resource busy"))
     assert isinstance(error, PortBusy)

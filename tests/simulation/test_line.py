@@ -26,7 +26,7 @@ class Listener:
     """The master's ear."""
 
     def __init__(self, line: SimulatedLine) -> None:
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.times: list[float] = []
         """When each piece was heard, in seconds since it began to listen."""
         self._news = asyncio.Event()
@@ -36,20 +36,20 @@ class Listener:
         line.attach(self._deliver)
 
     def _deliver(self, data: bytes) -> None:
-        self.heard.append(data)
+        self.received.append(data)
         self.times.append(self._loop.time() - self._start)
         self._news.set()
 
-    def say(self, *parts: bytes) -> None:
+    def send(self, *parts: bytes) -> None:
         for part in parts:
             self.line.receive(part)
 
     async def until(self, count: int) -> list[bytes]:
         async with asyncio.timeout(10):
-            while len(self.heard) < count:
+            while len(self.received) < count:
                 self._news.clear()
                 await self._news.wait()
-        return self.heard
+        return self.received
 
 
 def servo(servo_id: int = 1, position: int = 2048, baudrate: int = 1_000_000, return_delay: int = 0) -> SmsDevice:
@@ -67,7 +67,7 @@ def position_of(servo_id: int, position: int) -> bytes:
 
 
 @asynccontextmanager
-async def listening(
+async def connected(
     devices: Sequence[SmsDevice], *, baudrate: int = 1_000_000, wire_time: bool = True
 ) -> AsyncIterator[Listener]:
     loop = asyncio.get_running_loop()
@@ -83,9 +83,9 @@ def wire_time(request: pytest.FixtureRequest) -> bool:
 @virtual
 async def test_a_reply_comes_later_and_whole(wire_time: bool) -> None:
     """Never from within `receive`, and in one piece, also when the request came byte by byte."""
-    async with listening([servo()], wire_time=wire_time) as master:
-        master.say(*(bytes((byte,)) for byte in PING))
-        assert master.heard == []
+    async with connected([servo()], wire_time=wire_time) as master:
+        master.send(*(bytes((byte,)) for byte in PING))
+        assert master.received == []
         assert await master.until(1) == [ACK]
 
 
@@ -93,11 +93,11 @@ async def test_a_reply_comes_later_and_whole(wire_time: bool) -> None:
 async def test_bytes_take_their_time() -> None:
     """A reply is there when request, return delay and reply are over."""
     prompt, slow = servo(1), servo(2, return_delay=50)
-    async with listening([prompt, slow]) as master:
-        master.say(PING)
+    async with connected([prompt, slow]) as master:
+        master.send(PING)
         await master.until(1)
         assert master.times == [pytest.approx(12 * BYTE)]
-        master.say(encode(2, Instruction.READ, b"\x38\x02"))
+        master.send(encode(2, Instruction.READ, b"\x38\x02"))
         await master.until(2)
         assert master.times[1] - master.times[0] == pytest.approx(16 * BYTE + 100e-6)
 
@@ -105,8 +105,8 @@ async def test_bytes_take_their_time() -> None:
 @virtual
 async def test_bytes_of_a_slow_line_take_longer() -> None:
     """In the proportion of the rates, to the byte."""
-    async with listening([servo(baudrate=SLOW)], baudrate=SLOW) as master:
-        master.say(PING)
+    async with connected([servo(baudrate=SLOW)], baudrate=SLOW) as master:
+        master.send(PING)
         await master.until(1)
         assert master.times == [pytest.approx(12 * 10 / SLOW)]
 
@@ -114,18 +114,18 @@ async def test_bytes_of_a_slow_line_take_longer() -> None:
 @virtual
 async def test_pieces_of_a_request_queue_up() -> None:
     """A byte handed over while another is being said is said behind it, and no time is lost between."""
-    async with listening([servo()]) as master:
-        master.say(*(bytes((byte,)) for byte in PING))
+    async with connected([servo()]) as master:
+        master.send(*(bytes((byte,)) for byte in PING))
         await master.until(1)
         assert master.times == [pytest.approx(12 * BYTE)]
 
 
 @virtual
-async def test_the_backlog_is_what_is_still_to_be_said() -> None:
+async def test_the_backlog_is_the_time_of_unsent_bytes() -> None:
     """In seconds; none once it is said."""
-    async with listening([servo()]) as master:
+    async with connected([servo()]) as master:
         assert master.line.backlog() == 0
-        master.say(bytes(60) + PING)
+        master.send(bytes(60) + PING)
         assert master.line.backlog() == pytest.approx(66 * BYTE)
         await master.until(1)
         assert master.line.backlog() == 0
@@ -134,8 +134,8 @@ async def test_the_backlog_is_what_is_still_to_be_said() -> None:
 @virtual
 async def test_without_wire_time_nothing_takes_time() -> None:
     """Neither bytes nor return delay."""
-    async with listening([servo(return_delay=250)], wire_time=False) as master:
-        master.say(PING)
+    async with connected([servo(return_delay=250)], wire_time=False) as master:
+        master.send(PING)
         await master.until(1)
         assert master.times == [0.0]
 
@@ -144,8 +144,8 @@ async def test_without_wire_time_nothing_takes_time() -> None:
 async def test_the_next_frame_queues_behind_a_broadcast(wire_time: bool) -> None:
     """A broadcast has no answer to wait for, so two frames in one go are both obeyed."""
     write = encode(BROADCAST_ID, Instruction.WRITE, b"\x2e\x07\x00")
-    async with listening([servo()], wire_time=wire_time) as master:
-        master.say(write + encode(1, Instruction.READ, b"\x2e\x01"))
+    async with connected([servo()], wire_time=wire_time) as master:
+        master.send(write + encode(1, Instruction.READ, b"\x2e\x01"))
         assert await master.until(1) == [encode(1, 0, b"\x07")]
         assert master.line.collisions == 0
 
@@ -154,19 +154,19 @@ async def test_the_next_frame_queues_behind_a_broadcast(wire_time: bool) -> None
 @virtual
 async def test_a_master_that_does_not_wait_is_drowned(parts: tuple[bytes, ...]) -> None:
     """The reply is heard as the AND of both, and the second request by nobody."""
-    async with listening([servo(1, baudrate=SLOW), servo(2, baudrate=SLOW)], baudrate=SLOW) as master:
-        master.say(*parts)
+    async with connected([servo(1, baudrate=SLOW), servo(2, baudrate=SLOW)], baudrate=SLOW) as master:
+        master.send(*parts)
         assert await master.until(1) == [overlay(ACK, read_position(2), 0)]
         assert master.line.collisions == 1
-        master.say(PING)
+        master.send(PING)
         assert (await master.until(2))[1:] == [ACK]
 
 
 @virtual
 async def test_two_servos_of_one_id_speak_at_once(wire_time: bool) -> None:
     """Their bytes are ANDed, and it is counted."""
-    async with listening([servo(position=0x0F3), servo(position=0x33F)], wire_time=wire_time) as master:
-        master.say(read_position())
+    async with connected([servo(position=0x0F3), servo(position=0x33F)], wire_time=wire_time) as master:
+        master.send(read_position())
         garbled = bytes(a & b for a, b in zip(position_of(1, 0x0F3), position_of(1, 0x33F), strict=True))
         assert await master.until(1) == [garbled]
         assert master.line.collisions == 1
@@ -175,18 +175,18 @@ async def test_two_servos_of_one_id_speak_at_once(wire_time: bool) -> None:
 @virtual
 async def test_replies_that_overlap_in_part_are_one() -> None:
     """A second servo of that id, later by some bytes: the master hears one long piece."""
-    async with listening([servo(), servo(return_delay=50)]) as master:
-        master.say(encode(1, Instruction.READ, b"\x80\x14"))
+    async with connected([servo(), servo(return_delay=50)]) as master:
+        master.send(encode(1, Instruction.READ, b"\x80\x14"))
         reply = encode(1, 0, bytes(20))
         assert await master.until(1) == [blend(reply, reply, 10)]
-        assert len(master.heard[0]) == len(reply) + 10
+        assert len(master.received[0]) == len(reply) + 10
 
 
 @virtual
 async def test_replies_that_do_not_overlap_are_two() -> None:
     """A later reply of another servo with the same id is no collision."""
-    async with listening([servo(), servo(return_delay=50)]) as master:
-        master.say(PING)
+    async with connected([servo(), servo(return_delay=50)]) as master:
+        master.send(PING)
         assert await master.until(2) == [ACK, ACK]
         assert master.line.collisions == 0
 
@@ -194,8 +194,8 @@ async def test_replies_that_do_not_overlap_are_two() -> None:
 @virtual
 async def test_sync_read_answers_one_after_another(wire_time: bool) -> None:
     """In the order asked, whatever the order of the devices; a missing one holds nobody up."""
-    async with listening([servo(node, node * 100) for node in (3, 1, 2)], wire_time=wire_time) as master:
-        master.say(encode(BROADCAST_ID, Instruction.SYNC_READ, bytes((0x38, 2, 2, 9, 1, 3))))
+    async with connected([servo(node, node * 100) for node in (3, 1, 2)], wire_time=wire_time) as master:
+        master.send(encode(BROADCAST_ID, Instruction.SYNC_READ, bytes((0x38, 2, 2, 9, 1, 3))))
         assert await master.until(3) == [position_of(node, node * 100) for node in (2, 1, 3)]
         assert master.line.collisions == 0
 
@@ -204,26 +204,26 @@ async def test_sync_read_answers_one_after_another(wire_time: bool) -> None:
 async def test_a_servo_hears_only_its_own_rate(wire_time: bool) -> None:
     """Within 3 %."""
     devices = [servo(1, baudrate=500_000), servo(2, baudrate=1_000_000), servo(3, baudrate=1_020_000)]
-    async with listening(devices, wire_time=wire_time) as master:
-        master.say(PING, encode(2, Instruction.PING))
+    async with connected(devices, wire_time=wire_time) as master:
+        master.send(PING, encode(2, Instruction.PING))
         assert await master.until(1) == [encode(2, 0)]
-        master.say(encode(3, Instruction.PING))
+        master.send(encode(3, Instruction.PING))
         await master.until(2)
         master.line.set_baudrate(500_000)
-        master.say(PING)
+        master.send(PING)
         assert (await master.until(3))[2] == ACK
 
 
 @virtual
-async def test_another_rate_ends_what_was_being_said() -> None:
+async def test_another_rate_ends_what_was_being_sent() -> None:
     """Half a request, and a reply on its way, are lost; the same rate again loses nothing."""
-    async with listening([servo(1), servo(2, baudrate=SLOW)]) as master:
-        master.say(PING)
+    async with connected([servo(1), servo(2, baudrate=SLOW)]) as master:
+        master.send(PING)
         master.line.set_baudrate(SLOW)
-        master.say(PING[:3])
+        master.send(PING[:3])
         master.line.set_baudrate(1_000_000)
         master.line.set_baudrate(SLOW)
-        master.say(PING[3:] + encode(2, Instruction.PING))
+        master.send(PING[3:] + encode(2, Instruction.PING))
         master.line.set_baudrate(SLOW)
         assert await master.until(1) == [encode(2, 0)]
 
@@ -233,8 +233,8 @@ async def test_a_late_reply_comes_after_others(wire_time: bool) -> None:
     """The delay of a fault is kept with and without wire time."""
     slow, quick = servo(1), servo(2)
     slow.extra_delay = 0.02
-    async with listening([slow, quick], wire_time=wire_time) as master:
-        master.say(PING, encode(2, Instruction.PING))
+    async with connected([slow, quick], wire_time=wire_time) as master:
+        master.send(PING, encode(2, Instruction.PING))
         assert await master.until(2) == [encode(2, 0), ACK]
         assert master.line.collisions == 0
 
@@ -243,24 +243,24 @@ async def test_a_late_reply_comes_after_others(wire_time: bool) -> None:
 async def test_devices_can_be_reached_into(wire_time: bool) -> None:
     """A dead servo is silent, a servo added to the line answers."""
     device = servo(1)
-    async with listening([device], wire_time=wire_time) as master:
+    async with connected([device], wire_time=wire_time) as master:
         device.dead = True
         master.line.devices.append(servo(2))
-        master.say(PING)
-        master.say(encode(2, Instruction.PING))
+        master.send(PING)
+        master.send(encode(2, Instruction.PING))
         assert await master.until(1) == [encode(2, 0)]
 
 
 @virtual
 async def test_a_closed_line_is_silent(wire_time: bool) -> None:
     """Neither what was on its way nor what is asked later is answered; closing twice is allowed."""
-    async with listening([servo()], wire_time=wire_time) as other, listening([servo()], wire_time=wire_time) as master:
-        other.say(PING)
+    async with connected([servo()], wire_time=wire_time) as other, connected([servo()], wire_time=wire_time) as master:
+        other.send(PING)
         other.line.close()
-        other.say(PING)
-        master.say(PING)
+        other.send(PING)
+        master.send(PING)
         await master.until(1)
-        assert other.heard == []
+        assert other.received == []
 
 
 @virtual
@@ -270,7 +270,7 @@ async def test_a_line_nobody_listens_to_goes_on() -> None:
     line.receive(PING)
     await asyncio.sleep(0)
     master = Listener(line)
-    master.say(PING)
+    master.send(PING)
     assert await master.until(1) == [ACK]
     line.close()
 

@@ -21,25 +21,25 @@ PING = encode(1, Instruction.PING)
 ACK = encode(1, 0)
 
 
-class Ear(asyncio.Protocol):
+class Receiver(asyncio.Protocol):
     """Keeps what it hears, and whether it was told of the end."""
 
     def __init__(self) -> None:
-        self.heard = b""
+        self.received = b""
         self.lost = False
         self._news = asyncio.Event()
 
     def data_received(self, data: bytes) -> None:
-        self.heard += data
+        self.received += data
         self._news.set()
 
     async def until(self, count: int) -> bytes:
         """All that was heard, once it is so many bytes."""
         async with asyncio.timeout(1):
-            while len(self.heard) < count:
+            while len(self.received) < count:
                 self._news.clear()
                 await self._news.wait()
-        return self.heard
+        return self.received
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.lost = True
@@ -83,7 +83,7 @@ async def test_servos_outlive_connections() -> None:
     """What was written before the plug was pulled is there after it; the devices are at hand all the time."""
     with closing(link_of()) as link:
         (device,) = cast("list[SmsDevice]", link.line.devices)
-        first, second = Ear(), Ear()
+        first, second = Receiver(), Receiver()
         (await link.connect(first)).write(encode(1, Instruction.WRITE, b"\x2e\x07\x00"))
         assert await first.until(6) == ACK
         link.unplug()
@@ -99,30 +99,30 @@ async def test_servos_outlive_connections() -> None:
 async def test_a_line_is_opened_at_the_rate_of_its_config() -> None:
     """Whatever rate the last connection ended with."""
     with closing(link_of()) as link:
-        first, second = Ear(), Ear()
+        first, second = Receiver(), Receiver()
         transport = await link.connect(first)
         transport.set_baudrate(9_600)
         transport.write(PING)
         transport.abort()
         (await link.connect(second)).write(PING)
-        assert (await second.until(6), first.heard) == (ACK, b"")
+        assert (await second.until(6), first.received) == (ACK, b"")
 
 
 @virtual
 async def test_faults_stand_between() -> None:
     """Here every reply is said twice."""
     with closing(link_of(faults={"duplicate": 1.0})) as link:
-        ear = Ear()
-        (await link.connect(ear)).write(PING)
-        assert await ear.until(12) == 2 * ACK
+        receiver = Receiver()
+        (await link.connect(receiver)).write(PING)
+        assert await receiver.until(12) == 2 * ACK
 
 
 @virtual
 async def test_a_closed_link_is_silent() -> None:
     """The next one is another line, with other servos."""
-    ear, other = Ear(), Ear()
+    receiver, other = Receiver(), Receiver()
     with closing(link_of()) as link:
-        (await link.connect(ear)).write(PING)
+        (await link.connect(receiver)).write(PING)
     with closing(link_of()) as link:
         (await link.connect(other)).write(PING)
-        assert (await other.until(6), ear.heard) == (ACK, b"")
+        assert (await other.until(6), receiver.received) == (ACK, b"")

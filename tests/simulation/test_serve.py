@@ -48,12 +48,12 @@ async def served(buses: Mapping[str, SmsBus], folder: Path | None = None) -> Asy
 async def ask(port: serial.Serial, frame: bytes, size: int) -> bytes:
     """The next `size` bytes after saying `frame`."""
     loop = asyncio.get_running_loop()
-    heard = bytearray()
+    received = bytearray()
     done = asyncio.Event()
 
     def read() -> None:
-        heard.extend(os.read(port.fileno(), 4096))
-        if len(heard) >= size:
+        received.extend(os.read(port.fileno(), 4096))
+        if len(received) >= size:
             done.set()
 
     loop.add_reader(port.fileno(), read)
@@ -63,7 +63,7 @@ async def ask(port: serial.Serial, frame: bytes, size: int) -> bytes:
             await done.wait()
     finally:
         loop.remove_reader(port.fileno())
-    return bytes(heard)
+    return bytes(received)
 
 
 async def test_each_bus_has_its_own_port() -> None:

@@ -51,15 +51,15 @@ class Bench:
         self.devices = devices(self.options, models)
         self.now = 0.0
         self.baudrate = self.options.baudrate
-        self.said: list[Request[Any]] = []
+        self.sent: list[Request[Any]] = []
         """What the master said, repetitions included."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
 
     def exchange(self, request: Request[Any]) -> Any:
         """As the engine does it: three tries for what may be repeated."""
         for _ in range(TRIES if request.idempotent else 1):
-            self.said.append(request)
-            replies = self._heard(request)
+            self.sent.append(request)
+            replies = self._replies(request)
             if not request.replies:
                 return request.parse(())
             if replies:
@@ -71,23 +71,23 @@ class Bench:
 
     def frames(self) -> list[bytes]:
         """What was said since the last call."""
-        said, self.said = self.said, []
-        return [request.frame for request in said]
+        sent, self.sent = self.sent, []
+        return [request.frame for request in sent]
 
     def after(self, seconds: float) -> Bench:
         self.now += seconds
         return self
 
-    def _heard(self, request: Request[Any]) -> list[Frame]:
+    def _replies(self, request: Request[Any]) -> list[Frame]:
         """Answers that are whole and belong to the question; those that come at once collide."""
         packet = frame_of(request.frame)
-        said = [
+        sent = [
             reply.data for device in self.devices if device.baudrate == self.baudrate for reply in device.handle(packet, self.now)
         ]
-        if not said or self.loses(request):
+        if not sent or self.loses(request):
             return []
         codec = KstCodec(self.options.version_byte, strict=self.options.pad_check == "strict")
-        codec.receive_data(reduce(lambda one, other: blend(one, other, 0), said))
+        codec.receive_data(reduce(lambda one, other: blend(one, other, 0), sent))
         reply = codec.next_reply()
         return [reply] if reply is not None and request.answers(reply) else []
 
@@ -96,7 +96,7 @@ def device_of(**settings: Any) -> KstDevice:
     return KstDevice(packaged_model(), **settings)
 
 
-def tell(device: KstDevice, command: int, data: bytes = b"", *, to: int | None = None, now: float = 0.0) -> Frame | None:
+def ask_device(device: KstDevice, command: int, data: bytes = b"", *, to: int | None = None, now: float = 0.0) -> Frame | None:
     """What the device answers, if it does."""
     replies = device.handle(frame_of(encode(device.node if to is None else to, command, data, device.version)), now)
     assert len(replies) <= 1

@@ -70,7 +70,7 @@ async def move(bus: BusService, *, together: bool = False, **goals: float) -> di
 
 
 @virtual
-async def test_a_servo_is_met_enabled_moved_and_stopped() -> None:
+async def test_a_servo_is_identified_enabled_moved_and_stopped() -> None:
     async with running(status_bits={0: "hot"}) as (bus, servos, events):
         servos[1].status_bytes = b"\1\0"
         for name in bus.records:

@@ -30,7 +30,7 @@ READ = encode(0x25, Command.READ_POSITION)
 REPLY = encode(0x25, 0x59, encode_position(-109))
 
 
-def found(*pieces: bytes, codec: KstCodec | None = None) -> list[bytes]:
+def frames_in(*pieces: bytes, codec: KstCodec | None = None) -> list[bytes]:
     codec = codec or KstCodec()
     frames = []
     for piece in pieces:
@@ -57,8 +57,8 @@ DELIVERIES = pytest.mark.parametrize("how", ["whole", "bytes", "random"])
 
 
 @DELIVERIES
-def test_frames_are_found_however_they_are_delivered(how: str) -> None:
-    assert found(*chopped(READ + REPLY + READ, how)) == [READ, REPLY, READ]
+def test_frames_are_decoded_however_they_are_delivered(how: str) -> None:
+    assert frames_in(*chopped(READ + REPLY + READ, how)) == [READ, REPLY, READ]
 
 
 @DELIVERIES
@@ -79,7 +79,7 @@ def test_frames_are_found_however_they_are_delivered(how: str) -> None:
 )
 def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, how: str) -> None:
     codec = KstCodec()
-    assert found(*chopped(junk + REPLY + junk + READ, how), codec=codec) == [REPLY, READ]
+    assert frames_in(*chopped(junk + REPLY + junk + READ, how), codec=codec) == [REPLY, READ]
     assert codec.skipped == 2 * len(junk)
     assert codec.pending == 0
 
@@ -88,14 +88,14 @@ def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, how: str) -> None:
 def test_a_half_frame_does_not_swallow_the_next_one(how: str) -> None:
     """K8: whether a servo gives up half a frame is not told; this end always finds the next one."""
     for cut in range(SIZE):
-        assert found(*chopped(REPLY[:cut] + READ, how)) == [READ]
+        assert frames_in(*chopped(REPLY[:cut] + READ, how)) == [READ]
 
 
 @DELIVERIES
 def test_header_and_trailer_inside_the_data_do_not_mislead(how: str) -> None:
     """K22."""
     inside = encode(0xFE, 0x5A, b"\xfe\xca\x0a\xfe")
-    assert found(*chopped(b"\xfe" + inside + b"\xca" + inside, how)) == [inside, inside]
+    assert frames_in(*chopped(b"\xfe" + inside + b"\xca" + inside, how)) == [inside, inside]
 
 
 @pytest.mark.parametrize("at", range(SIZE))
@@ -103,46 +103,46 @@ def test_every_byte_of_a_frame_counts(at: int) -> None:
     for change in (0x01, 0x80, 0xFF):
         codec = KstCodec()
         broken = REPLY[:at] + bytes((REPLY[at] ^ change,)) + REPLY[at + 1 :]
-        assert found(broken, codec=codec) == []
-        assert found(READ, codec=codec) == [READ]
+        assert frames_in(broken, codec=codec) == []
+        assert frames_in(READ, codec=codec) == [READ]
 
 
 def test_another_version_byte_is_no_frame_unless_it_is_the_one_set() -> None:
     """K6."""
     other = encode(0x25, Command.READ_ID, version=0xCB)
-    assert found(other) == []
-    assert found(other, codec=KstCodec(0xCB)) == [other]
-    assert found(READ, codec=KstCodec(0xCB)) == []
+    assert frames_in(other) == []
+    assert frames_in(other, codec=KstCodec(0xCB)) == [other]
+    assert frames_in(READ, codec=KstCodec(0xCB)) == []
 
 
 @pytest.mark.parametrize(("code", "size"), [(code, size) for code, size in DATA_SIZES.items() if size < DATA_SIZE])
 def test_unused_data_bytes_must_be_zero_unless_that_is_ignored(code: int, size: int) -> None:
     """K14."""
     full, over = encode(1, code, b"\1" * size), encode(1, code, b"\1" * (size + 1))
-    assert found(full, over, codec=KstCodec()) == [full]
-    assert found(full, over, codec=KstCodec(strict=False)) == [full, over]
+    assert frames_in(full, over, codec=KstCodec()) == [full]
+    assert frames_in(full, over, codec=KstCodec(strict=False)) == [full, over]
 
 
 def test_of_codes_nobody_defines_all_data_is_taken() -> None:
     frame = encode(1, 0x8F, b"12345678")
-    assert found(frame) == [frame]
+    assert frames_in(frame) == [frame]
 
 
 def test_memory_is_bounded_by_one_undecided_frame() -> None:
     codec = KstCodec()
     for byte in b"\xfe\xca" * 500 + b"\xfe" * 500 + bytes(500):
-        found(bytes((byte,)), codec=codec)
+        frames_in(bytes((byte,)), codec=codec)
         assert codec.pending < SIZE
     assert codec.pending + codec.skipped == 2000
 
 
-def test_reset_forgets_what_was_heard() -> None:
+def test_reset_forgets_what_was_received() -> None:
     codec = KstCodec()
-    assert found(READ[:7], codec=codec) == []
+    assert frames_in(READ[:7], codec=codec) == []
     assert codec.pending == 7
     codec.reset()
     assert codec.pending == 0
-    assert found(READ[7:], codec=codec) == []
+    assert frames_in(READ[7:], codec=codec) == []
 
 
 @steady
@@ -153,11 +153,11 @@ def test_reset_forgets_what_was_heard() -> None:
     st.binary(max_size=30),
     st.integers(0, 99),
 )
-def test_what_is_encoded_is_found_again(address: int, code: int, data: bytes, junk: bytes, seed: int) -> None:
+def test_what_is_encoded_is_decoded_again(address: int, code: int, data: bytes, junk: bytes, seed: int) -> None:
     data = data[: DATA_SIZES[code]]
     frame = encode(address, code, data)
     codec = KstCodec()
-    assert found(*chopped(frame + junk, "random", seed), codec=codec)[0] == frame
+    assert frames_in(*chopped(frame + junk, "random", seed), codec=codec)[0] == frame
     assert frame_of(frame) == Frame(address, code, data.ljust(DATA_SIZE, b"\0"), frame)
 
 
@@ -165,7 +165,7 @@ def test_what_is_encoded_is_found_again(address: int, code: int, data: bytes, ju
 @given(st.binary(max_size=200))
 def test_no_input_breaks_it_and_nothing_is_lost_from_the_count(data: bytes) -> None:
     codec = KstCodec()
-    whole = b"".join(found(data, codec=codec))
+    whole = b"".join(frames_in(data, codec=codec))
     assert codec.skipped + codec.pending + len(whole) == len(data)
 
 
@@ -183,7 +183,7 @@ def test_what_a_frame_cannot_carry_is_refused(address: int, code: int, data: byt
         encode(address, code, data)
 
 
-def test_a_reply_is_known_by_its_servo_and_the_command_it_answers() -> None:
+def test_a_reply_has_the_key_of_the_command_it_answers() -> None:
     """K15: replies and refusals of one command can be taken for each other, and nothing else."""
     assert {frame_of(encode(7, code)).key for code in (0x19, 0x59, 0xD9)} == {0x19}
     frame = frame_of(REPLY)
@@ -247,7 +247,7 @@ def test_a_version_is_text_if_all_of_it_can_be_printed(data: bytes, text: str) -
         (encode(1, 0x81), "id 1 code 0x81, which the protocol does not use: 00 00 00 00 00 00 00 00"),
     ],
 )
-def test_frames_in_words(frame: bytes, text: str) -> None:
+def test_frames_are_described(frame: bytes, text: str) -> None:
     assert KstCodec().describe(frame, sent=True) == KstCodec().describe(frame, sent=False) == text
     assert describe(frame_of(frame)) == text
 

@@ -25,13 +25,13 @@ def new_servo(**keys: Any) -> tuple[Bench, KstCommissioning]:
     return bench, bench.driver.commissioning
 
 
-def test_a_new_id_is_read_back_saved_and_found_after_a_restart() -> None:
+def test_a_new_id_is_read_back_saved_and_answers_after_a_restart() -> None:
     bench, commissioning = new_servo()
     change = bench.run(commissioning.set_id(FACTORY_ID, 5, save=True))
     assert (change.what, change.value, change.saved, change.pending_reboot, change.notes) == ("id", 5, True, True, ())
-    said = bench.frames()
-    assert said[0] == encode(5, Command.READ_ID)
-    assert said[-3:] == [
+    frames = bench.frames()
+    assert frames[0] == encode(5, Command.READ_ID)
+    assert frames[-3:] == [
         encode(FACTORY_ID, Command.SET_ID, b"\5"),
         encode(FACTORY_ID, Command.READ_ID),
         encode(FACTORY_ID, Command.SAVE, b"save"),
@@ -42,7 +42,7 @@ def test_a_new_id_is_read_back_saved_and_found_after_a_restart() -> None:
     assert commissioning.pending == {}
 
 
-def test_until_the_restart_it_is_addressed_as_before_and_says_what_waits() -> None:
+def test_until_the_restart_the_old_id_answers_and_reports_the_change() -> None:
     """K5."""
     bench, commissioning = new_servo()
     bench.run(commissioning.set_id(FACTORY_ID, 5))
@@ -201,7 +201,7 @@ def test_nothing_is_changed_where_answers_are_missing() -> None:
         bench.run(commissioning.set_id(FACTORY_ID, 5))
 
 
-def test_neither_id_nor_rate_nor_save_is_said_twice() -> None:
+def test_neither_id_nor_rate_nor_save_is_sent_twice() -> None:
     bench, commissioning = new_servo(save_reply="required")
     once = (Command.SET_ID, Command.SET_BAUD, Command.SAVE)
     bench.loses = lambda request: request.frame[3] in once
@@ -229,7 +229,7 @@ def test_a_servo_that_says_another_id_afterwards_is_not_saved() -> None:
 def test_save_waits_for_no_answer_and_leaves_the_flash_its_time() -> None:
     bench, commissioning = new_servo(save_settle_ms=300)
     assert bench.run(commissioning.save(FACTORY_ID)) == ()
-    (request,) = bench.said
+    (request,) = bench.sent
     assert (request.replies, request.quiet_after) == (0, 0.3)
 
 
@@ -244,7 +244,7 @@ def test_save_is_the_command_with_a_name() -> None:
     assert bench.frames() == []
 
 
-def test_an_optional_answer_may_be_missing_and_a_refusal_is_told() -> None:
+def test_an_optional_reply_may_be_missing_and_a_refusal_is_a_note() -> None:
     bench, commissioning = new_servo(save_reply="optional")
     assert bench.run(commissioning.save(FACTORY_ID)) == ()
     bench.devices[0].answers_save = True
@@ -275,7 +275,7 @@ def test_an_id_that_counts_at_once_is_read_back_and_saved_there() -> None:
     assert commissioning.pending == {}
 
 
-def test_a_rate_that_counts_at_once_leaves_the_read_back_to_who_sets_the_line() -> None:
+def test_a_rate_that_counts_at_once_is_not_read_back() -> None:
     bench, commissioning = new_servo(id_effective="immediate")
     change = bench.run(commissioning.set_baudrate(FACTORY_ID, 9600))
     assert (change.pending_reboot, bench.devices[0].baudrate) == (False, 9600)

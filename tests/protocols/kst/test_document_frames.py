@@ -10,7 +10,7 @@ from servobus.protocols.base import Request, run_plan
 from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.codec import BAUD_TABLE, FACTORY_ID, Command, decode_position, encode, encode_position, version_text
 from servobus.protocols.kst.requests import Fence, Read, RequestSettings, Save, SetValue, UnansweredCommand
-from tests.protocols.kst.bench import Bench, device_of, frame_of, tell
+from tests.protocols.kst.bench import Bench, ask_device, device_of, frame_of
 
 # Section 3.5: position, High, Low.
 POSITIONS = [(-90, 0xFC, 0x7C), (-10.9, 0xFF, 0x93), (-0.8, 0xFF, 0xF8), (0, 0, 0), (0.8, 0, 8), (10.9, 0, 0x6D), (90, 3, 0x84)]
@@ -100,10 +100,10 @@ LAYOUTS: list[tuple[Request[Any], str, str, Any]] = [
 )
 def test_every_command_and_its_reply(request_: Request[Any], frame: str, reply: str, value: Any) -> None:
     assert request_.frame == bytes.fromhex(frame)
-    heard = frame_of(bytes.fromhex(reply))
-    assert request_.answers(heard)
-    assert request_.parse([heard]) == value
-    assert (request_.replies, request_.reply_size, request_.reply_key) == (1, 14, heard.key)
+    decoded = frame_of(bytes.fromhex(reply))
+    assert request_.answers(decoded)
+    assert request_.parse([decoded]) == value
+    assert (request_.replies, request_.reply_size, request_.reply_key) == (1, 14, decoded.key)
 
 
 @pytest.mark.parametrize(
@@ -130,9 +130,9 @@ def test_save_needs_no_reply_and_gives_the_flash_its_time() -> None:
 
 def test_id_and_rate_take_effect_when_saved_and_restarted() -> None:
     device = device_of()
-    assert tell(device, Command.SET_ID, b"\5") == frame_of(encode(0x25, 0x48, b"\5"))
-    assert tell(device, Command.SET_BAUD, b"\4") == frame_of(encode(0x25, 0x46, b"\4"))
-    assert tell(device, Command.SAVE, b"save") is None
+    assert ask_device(device, Command.SET_ID, b"\5") == frame_of(encode(0x25, 0x48, b"\5"))
+    assert ask_device(device, Command.SET_BAUD, b"\4") == frame_of(encode(0x25, 0x46, b"\4"))
+    assert ask_device(device, Command.SAVE, b"save") is None
     assert (device.node, device.baudrate) == (0x25, 512_000)
     device.reboot(1.0)
     assert (device.node, device.baudrate) == (5, 115_200)
@@ -140,10 +140,10 @@ def test_id_and_rate_take_effect_when_saved_and_restarted() -> None:
 
 def test_a_position_is_taken_at_once_and_lost_by_a_restart() -> None:
     device = device_of(position=300)
-    tell(device, Command.SET_POSITION, encode_position(600), now=0.0)
+    ask_device(device, Command.SET_POSITION, encode_position(600), now=0.0)
     assert device.goal == 600
     device.reboot(1.0)
-    tell(device, Command.READ_POSITION, now=5.0)
+    ask_device(device, Command.READ_POSITION, now=5.0)
     assert (device.goal, device.position) == (0, 0)
 
 

@@ -38,7 +38,7 @@ def test_the_host_keeps_the_speed(keys: dict[str, Any], fields: dict[str, Any], 
     assert driver.host_speed(ServoGoal("pan", wanted, start=10.0)) == speed
 
 
-def test_nobody_is_led_from_an_unknown_place() -> None:
+def test_the_host_keeps_no_speed_from_an_unknown_position() -> None:
     with pytest.raises(LimitError, match="its position is not known"):
         Bench().driver.host_speed(ServoGoal("pan", Goal("position", 1.0)))
 
@@ -156,7 +156,7 @@ def test_nothing_is_written_by_name(name: str, reason: str) -> None:
         Bench().driver.write_register("pan", name, 1, persist=True)
 
 
-def test_unknown_names_are_told() -> None:
+def test_unknown_names_are_refused() -> None:
     driver = Bench().driver
     with pytest.raises(UnknownName, match="no register 'temperature'; it has baud_rate, firmware_version"):
         driver.read_register("pan", "temperature")
@@ -216,8 +216,8 @@ def test_a_lenient_and_other_version_line_works_end_to_end() -> None:
     """K6, K14."""
     bench = Bench(version_byte=0xCB, pad_check="ignore", min_gap_us=100)
     assert run_plan(bench.driver.identify("pan"), bench.exchange).firmware == "1.00"
-    assert {request.frame[1] for request in bench.said} == {0xCB}
-    assert {request.quiet_after for request in bench.said} == {100e-6}
+    assert {request.frame[1] for request in bench.sent} == {0xCB}
+    assert {request.quiet_after for request in bench.sent} == {100e-6}
 
 
 def test_driver_is_made_from_options_and_models() -> None:

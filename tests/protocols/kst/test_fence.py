@@ -35,7 +35,7 @@ def test_a_fence_that_was_not_answered_is_followed_by_another_kind() -> None:
     assert bench.frames() == [encode(1, Command.READ_VERSION), encode(1, Command.READ_STATUS)]
 
 
-def test_behind_a_fence_the_position_is_asked_once_or_behind_another_fence() -> None:
+def test_after_a_fence_the_position_is_read_once() -> None:
     """Said twice, the answer to the first question could be taken for that to the second."""
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
@@ -94,7 +94,7 @@ def test_a_servo_that_stands_where_nobody_sent_it_has_restarted() -> None:
     assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))
 
 
-def test_a_restart_that_changes_nothing_is_not_seen() -> None:
+def test_a_restart_that_changes_nothing_is_not_detected() -> None:
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
     bench.devices[0].reboot(0.0)

@@ -74,7 +74,7 @@ def test_the_servo_goes_there_at_its_own_speed() -> None:
     assert bench.after(5).exchange(read) == 90
 
 
-def test_a_goal_without_answer_is_said_again_and_then_given_up_as_perhaps_obeyed() -> None:
+def test_a_goal_without_reply_is_repeated_and_may_have_been_obeyed() -> None:
     bench = enabled()
     bench.loses = lambda request: True
     assert isinstance(move(bench, pan=10)["pan"], ReplyTimeout)
@@ -141,7 +141,7 @@ def test_limp_is_a_hold_that_says_so() -> None:
     assert bench.frames() == [position_frame(1, -200)]
 
 
-def test_a_servo_that_does_not_answer_is_told_twice_more_after_all_others() -> None:
+def test_a_silent_servo_is_stopped_twice_more_after_the_others() -> None:
     bench = enabled()
     bench.loses = lambda request: request.node == 1
     reports = bench.run(bench.driver.stop([target("pan"), target("tilt")]))
@@ -156,10 +156,10 @@ def test_an_offline_servo_is_written_to_and_not_waited_for() -> None:
     bench = enabled()
     reports = bench.run(bench.driver.stop([target("pan", reachable=False), target("tilt")]))
     assert reports["pan"] == StopReport("hold", True, False, "offline: nothing was confirmed")
-    assert [(request.node, request.replies) for request in bench.said] == [(2, 1), (1, 0), (1, 0)]
+    assert [(request.node, request.replies) for request in bench.sent] == [(2, 1), (1, 0), (1, 0)]
 
 
-def test_where_nothing_is_known_the_position_is_asked_for() -> None:
+def test_a_stop_reads_a_position_that_it_does_not_have() -> None:
     bench = Bench()
     bench.devices[0].position = bench.devices[0].goal = 333
     assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed

@@ -16,9 +16,9 @@ def factory_bench() -> Bench:
 
 def test_one_servo_raises_no_suspicion() -> None:
     bench = factory_bench()
-    seen = bench.run(bench.driver.inspect(FACTORY_ID))
-    assert (seen.model, seen.firmware, seen.notes) == ("kst", "1.00", ())
-    assert len(bench.said) == 2 * ROUNDS
+    result = bench.run(bench.driver.inspect(FACTORY_ID))
+    assert (result.model, result.firmware, result.notes) == ("kst", "1.00", ())
+    assert len(bench.sent) == 2 * ROUNDS
 
 
 def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
@@ -31,7 +31,7 @@ def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
 
 
 @pytest.mark.parametrize("position", [0, -333])
-def test_two_servos_whose_answers_agree_or_melt_into_one_cannot_be_told_apart(position: int) -> None:
+def test_two_servos_with_equal_replies_are_taken_for_one(position: int) -> None:
     """K17: a clash is never excluded. The answers 0 and -333 at once make the very frame of the answer 0."""
     bench = factory_bench()
     bench.devices.append(device_of(position=position))
@@ -69,11 +69,11 @@ def test_a_position_that_jumps_is_suspected(way: int, suspected: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("places", "suspected"), [((0, 50, 100, 150, 200), False), ((0, 50, 0, 50, 0), True), ((9, 0, 9, 0, 9), False)]
+    ("positions", "suspected"), [((0, 50, 100, 150, 200), False), ((0, 50, 0, 50, 0), True), ((9, 0, 9, 0, 9), False)]
 )
-def test_a_configured_servo_may_be_on_its_way_but_not_to_and_fro(places: tuple[int, ...], suspected: bool) -> None:
+def test_a_configured_servo_may_be_on_its_way_but_not_to_and_fro(positions: tuple[int, ...], suspected: bool) -> None:
     bench = factory_bench()
-    turns = iter([place for place in places for _ in range(2)])
+    turns = iter([position for position in positions for _ in range(2)])
 
     def go(request: object) -> bool:
         bench.devices[0].position = bench.devices[0].goal = float(next(turns))
@@ -86,8 +86,8 @@ def test_a_configured_servo_may_be_on_its_way_but_not_to_and_fro(places: tuple[i
 def test_a_refusal_is_no_sign_of_a_second_servo() -> None:
     bench = Bench()
     bench.devices[0].refuses = {Command.READ_VERSION: 0x06020000}
-    seen = bench.run(bench.driver.inspect(1))
-    assert (seen.firmware, seen.notes) == (None, ())
+    result = bench.run(bench.driver.inspect(1))
+    assert (result.firmware, result.notes) == (None, ())
     assert bench.run(bench.driver.identify("pan")).firmware is None
 
 
@@ -95,20 +95,20 @@ def test_where_nothing_answers_there_is_nobody() -> None:
     bench = Bench()
     with pytest.raises(ReplyTimeout):
         bench.run(bench.driver.inspect(3))
-    assert len(bench.said) == 2 * ROUNDS
+    assert len(bench.sent) == 2 * ROUNDS
 
 
-def test_a_configured_servo_is_asked_in_short_unless_it_has_the_factory_id() -> None:
+def test_a_configured_servo_is_asked_once_unless_it_has_the_factory_id() -> None:
     bench = Bench({"pan": {"id": 1}, "new": {"id": FACTORY_ID}})
-    seen = bench.run(bench.driver.identify("pan"))
-    assert (seen.firmware, seen.mode, len(bench.said)) == ("1.00", "position", 1)
+    result = bench.run(bench.driver.identify("pan"))
+    assert (result.firmware, result.mode, len(bench.sent)) == ("1.00", "position", 1)
     bench.devices.append(device_of(position=111))
     assert "two servos with id 37" in bench.run(bench.driver.identify("new")).notes[0]
 
 
-def test_a_learned_byte_order_is_told() -> None:
+def test_a_learned_byte_order_is_a_note() -> None:
     bench = Bench()
     bench.driver.settings.aborts.code(b"\x30\x00\x09\x06")
     assert "low byte first" in bench.run(bench.driver.identify("pan")).notes[0]
-    told = Bench(sdo_order="le")
-    assert told.run(told.driver.identify("pan")).notes == ()
+    bench = Bench(sdo_order="le")
+    assert bench.run(bench.driver.identify("pan")).notes == ()

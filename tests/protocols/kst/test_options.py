@@ -43,9 +43,9 @@ def test_limp_is_refused_with_the_reason(key: str) -> None:
 
 @pytest.mark.parametrize("key", ["acceleration", "torque_limit"])
 def test_what_has_no_command_is_refused(key: str) -> None:
-    found = refusal(servos={"pan": {"id": 1, key: 5}})
-    assert f"servos.pan.{key}" in found
-    assert "a KST servo has no command for it" in found
+    message = refusal(servos={"pan": {"id": 1, key: 5}})
+    assert f"servos.pan.{key}" in message
+    assert "a KST servo has no command for it" in message
     assert getattr(bus_options({"pan": {"id": 1, key: None}}).servos["pan"], key) is None
 
 
@@ -115,7 +115,7 @@ def test_what_requests_take_from_the_options() -> None:
 # Models
 
 
-def test_the_packaged_model_is_found_once_for_all_servos() -> None:
+def test_the_packaged_model_is_read_once_for_all_servos() -> None:
     models = load_models(bus_options(), Path())
     assert dict(models) == {"kst": packaged_model()}
     assert packaged_model().goal_ranges["position"] == (-900, 900)
@@ -128,7 +128,7 @@ def test_an_own_model_stands_beside_the_config(tmp_path: Path) -> None:
     assert load_models(options, tmp_path)["wide.yaml"].range == (-920, 920)
 
 
-def test_a_model_that_is_none_is_refused_with_its_place(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_model_is_refused_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text((FILES.folder / "kst.yaml").read_text().replace("[-900, 900]", "[-960, 900]"))
     with pytest.raises(ConfigError, match=r"bad\.yaml:.*range \[-960, 900\] must be ascending"):
         FILES.read(tmp_path / "bad.yaml")

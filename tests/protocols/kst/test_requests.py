@@ -50,7 +50,7 @@ def test_another_value_than_the_one_sent_is_a_mismatch() -> None:
     lenient.parse([frame_of(encode(7, 0x49, encode_position(-108)))])
 
 
-def test_what_may_be_said_again() -> None:
+def test_which_requests_may_be_repeated() -> None:
     position = encode_position(0)
     assert SetValue(SETTINGS, 1, Command.SET_POSITION, position).idempotent
     assert UnansweredCommand(SETTINGS, 1, Command.SET_POSITION, position).idempotent
@@ -66,7 +66,7 @@ def test_what_may_be_said_again() -> None:
     assert not any(request.idempotent for request in never)
 
 
-def test_the_answer_to_a_new_id_may_come_from_it_where_that_is_expected() -> None:
+def test_the_reply_to_a_new_id_may_come_from_the_new_id() -> None:
     """K5."""
     reply = frame_of(encode(5, 0x48, b"\5"))
     assert not SetValue(SETTINGS, 1, Command.SET_ID, b"\5").answers(reply)

@@ -110,7 +110,7 @@ def test_no_step_is_further_than_half_of_one(position: float) -> None:
     ("raw", "believed", "outside"),
     [(900, True, False), (901, True, True), (950, True, True), (951, False, False), (-950, True, True), (-951, False, False)],
 )
-def test_a_reading_slightly_outside_is_flagged_and_far_outside_not_believed(raw: int, believed: bool, outside: bool) -> None:
+def test_a_reading_outside_is_a_fault_and_far_outside_refused(raw: int, believed: bool, outside: bool) -> None:
     """K11."""
     servo = fitted()
     if believed:

@@ -32,11 +32,11 @@ WRITE = encode(2, Function.WRITE_MULTIPLE, pack((1135, 2)) + b"\x04" + pack((7, 
 WROTE = encode(2, Function.WRITE_MULTIPLE, pack((1135, 2)))
 SINGLE = encode(2, Function.WRITE_SINGLE, pack((1010, 500)))
 NO = encode(2, 0x90, b"\4")
-HEARD = (REPLY, WROTE, SINGLE, NO)
+RECEIVED = (REPLY, WROTE, SINGLE, NO)
 ASKED = (READ, WRITE, SINGLE)
 
 
-def found(codec: ModbusCodec, *pieces: bytes) -> list[bytes]:
+def frames_in(codec: ModbusCodec, *pieces: bytes) -> list[bytes]:
     frames = []
     for piece in pieces:
         codec.receive_data(piece)
@@ -100,7 +100,7 @@ def test_units_at_the_edge(unit: int) -> None:
 
 
 @given(st.lists(st.integers(0, 65535), max_size=20))
-def test_words_round_trip(values: list[int]) -> None:
+def test_registers_round_trip(values: list[int]) -> None:
     assert unpack(pack(values)) == values
 
 
@@ -109,19 +109,19 @@ def test_words_round_trip(values: list[int]) -> None:
 
 @DELIVERIES
 def test_a_master_finds_answers_however_they_are_delivered(how: str) -> None:
-    assert found(ModbusCodec(), *chopped(b"".join(HEARD), how)) == list(HEARD)
+    assert frames_in(ModbusCodec(), *chopped(b"".join(RECEIVED), how)) == list(RECEIVED)
 
 
 @DELIVERIES
 def test_a_device_finds_questions_however_they_are_delivered(how: str) -> None:
-    assert found(ModbusCodec("device"), *chopped(b"".join(ASKED), how)) == list(ASKED)
+    assert frames_in(ModbusCodec("device"), *chopped(b"".join(ASKED), how)) == list(ASKED)
 
 
 @DELIVERIES
 @pytest.mark.parametrize("echoed", ASKED)
 def test_a_master_finds_its_own_echo_before_the_answer(echoed: bytes, how: str) -> None:
     codec = ModbusCodec()
-    assert found(codec, *chopped(echoed + REPLY, how)) == [echoed, REPLY]
+    assert frames_in(codec, *chopped(echoed + REPLY, how)) == [echoed, REPLY]
     assert codec.skipped == 0
 
 
@@ -130,7 +130,7 @@ def test_a_master_finds_its_own_echo_before_the_answer(echoed: bytes, how: str) 
 @pytest.mark.parametrize("junk", [b"\0", b"\0" * 9, b"\xff" * 20, b"\2\x44", b"\xf8\3", b"\2\x83\4\0\0", b"\7\x41\xff"])
 def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, end: str, how: str) -> None:
     codec, frame = (ModbusCodec(), WROTE) if end == "master" else (ModbusCodec("device"), SINGLE)
-    assert found(codec, *chopped(junk + frame + junk + frame, how)) == [frame, frame]
+    assert frames_in(codec, *chopped(junk + frame + junk + frame, how)) == [frame, frame]
     assert (codec.skipped, codec.pending) == (2 * len(junk), 0)
 
 
@@ -138,27 +138,27 @@ def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, end: str, how: str
 @pytest.mark.parametrize("end", ["master", "device"])
 def test_a_half_frame_swallows_no_more_than_the_longest_frame(end: str, how: str) -> None:
     """What it begins may be as long as its byte count says; whoever speaks next resets the codec anyway."""
-    frames = HEARD if end == "master" else ASKED
+    frames = RECEIVED if end == "master" else ASKED
     for frame in frames:
         for cut in range(len(frame)):
             codec = ModbusCodec() if end == "master" else ModbusCodec("device")
             after = [frames[0]] * 35
-            assert found(codec, *chopped(frame[:cut] + b"".join(after), how))[-2:] == after[-2:]
+            assert frames_in(codec, *chopped(frame[:cut] + b"".join(after), how))[-2:] == after[-2:]
 
 
-@pytest.mark.parametrize("frame", HEARD)
+@pytest.mark.parametrize("frame", RECEIVED)
 def test_every_byte_of_a_frame_counts(frame: bytes) -> None:
     for at in range(len(frame)):
         for change in (0x01, 0x80, 0xFF):
             broken = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
-            assert frame not in found(ModbusCodec(), broken, b"\xff" * 300)
-            assert broken not in found(ModbusCodec(), broken, b"\xff" * 300)
+            assert frame not in frames_in(ModbusCodec(), broken, b"\xff" * 300)
+            assert broken not in frames_in(ModbusCodec(), broken, b"\xff" * 300)
 
 
 @given(st.binary(max_size=400), st.sampled_from(["master", "device"]))
 def test_noise_is_survived_and_nothing_is_kept_that_no_frame_needs(data: bytes, end: str) -> None:
     codec = ModbusCodec() if end == "master" else ModbusCodec("device")
-    frames = found(codec, data)
+    frames = frames_in(codec, data)
     assert sum(map(len, frames)) + codec.skipped + codec.pending == len(data)
     assert all(crc16(frame) == 0 for frame in frames)
     assert codec.pending < 273
@@ -169,10 +169,10 @@ def test_noise_is_survived_and_nothing_is_kept_that_no_frame_needs(data: bytes, 
 @given(st.binary(max_size=60), st.integers(1, 40))
 def test_where_it_is_cut_makes_no_difference(noise: bytes, seed: int) -> None:
     data = noise + REPLY + noise + NO
-    assert found(ModbusCodec(), *chopped(data, "random", seed)) == found(ModbusCodec(), data)
+    assert frames_in(ModbusCodec(), *chopped(data, "random", seed)) == frames_in(ModbusCodec(), data)
 
 
-def test_the_work_for_each_byte_is_bounded() -> None:
+def test_the_time_for_each_byte_is_bounded() -> None:
     """A stream in which each byte may begin the longest frame: one CRC for each, and no more is kept than that frame."""
     codec = ModbusCodec()
     for _ in range(20):
@@ -188,25 +188,25 @@ def test_the_work_for_each_byte_is_bounded() -> None:
 def test_an_answer_of_no_whole_registers_is_none(count: int) -> None:
     data = encode(2, 3, bytes((count,)) + bytes(count))
     codec = ModbusCodec()
-    assert data not in found(codec, data)
+    assert data not in frames_in(codec, data)
 
 
 @pytest.mark.parametrize("registers", [1, MAX_READ])
 def test_answers_at_the_edge(registers: int) -> None:
     data = encode(2, 3, bytes((2 * registers,)) + bytes(2 * registers))
-    assert found(ModbusCodec(), data) == [data]
+    assert frames_in(ModbusCodec(), data) == [data]
 
 
 @pytest.mark.parametrize("registers", [1, MAX_WRITE])
 def test_writes_at_the_edge(registers: int) -> None:
     data = encode(2, 16, pack((1, registers)) + bytes((2 * registers,)) + bytes(2 * registers))
-    assert found(ModbusCodec("device"), data) == [data]
+    assert frames_in(ModbusCodec("device"), data) == [data]
 
 
 @pytest.mark.parametrize(("registers", "size"), [(0, 0), (MAX_WRITE + 1, 248), (2, 2), (1, 3)])
 def test_a_write_whose_number_and_bytes_differ_is_none(registers: int, size: int) -> None:
     data = encode(2, 16, pack((1, registers)) + bytes((size,)) + bytes(size))
-    assert data not in found(ModbusCodec("device"), data)
+    assert data not in frames_in(ModbusCodec("device"), data)
 
 
 @pytest.mark.parametrize(
@@ -223,13 +223,13 @@ def test_a_write_whose_number_and_bytes_differ_is_none(registers: int, size: int
 )
 def test_a_device_reads_the_other_functions_too(content: tuple[int, bytes]) -> None:
     data = encode(2, *content)
-    assert found(ModbusCodec("device"), *chopped(data + READ, "bytes")) == [data, READ]
+    assert frames_in(ModbusCodec("device"), *chopped(data + READ, "bytes")) == [data, READ]
 
 
 # What frames say
 
 
-def test_a_frame_knows_its_node_and_its_look() -> None:
+def test_a_frame_has_its_node_and_its_key() -> None:
     codec = ModbusCodec()
     codec.receive_data(REPLY + WROTE + SINGLE + NO)
     reply, wrote, single, refused = (codec.next_reply() for _ in range(4))
@@ -244,12 +244,12 @@ def test_a_frame_knows_its_node_and_its_look() -> None:
     assert refused.key == reply_key(0x90, b"\4")
 
 
-@given(st.sampled_from(HEARD), st.integers())
+@given(st.sampled_from(RECEIVED), st.integers())
 def test_renamed_it_is_another_units_and_right(frame: bytes, seed: int) -> None:
     other = rename(frame, random.Random(seed))
     assert node_of(other) != node_of(frame)
     assert 1 <= node_of(other) <= MAX_UNIT
-    assert found(ModbusCodec(), other) == [other]
+    assert frames_in(ModbusCodec(), other) == [other]
 
 
 @pytest.mark.parametrize(
@@ -270,6 +270,6 @@ def test_renamed_it_is_another_units_and_right(frame: bytes, seed: int) -> None:
         (WROTE + b"\0", False, f"not a Modbus-RTU frame: {(WROTE + bytes(1)).hex(' ')}"),
     ],
 )
-def test_frames_in_words(frame: bytes, sent: bool, text: str) -> None:
+def test_frames_are_described(frame: bytes, sent: bool, text: str) -> None:
     assert describe(frame, sent=sent) == text
     assert ModbusCodec().describe(frame, sent=sent) == text

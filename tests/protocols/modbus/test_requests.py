@@ -27,10 +27,10 @@ def frame(text: str | bytes) -> Frame:
     data = bytes.fromhex(text) if isinstance(text, str) else text
     codec = ModbusCodec()
     codec.receive_data(data)
-    found = codec.next_reply()
-    assert found is not None
-    assert found.frame == data
-    return found
+    reply = codec.next_reply()
+    assert reply is not None
+    assert reply.frame == data
+    return reply
 
 
 def read(address: int, count: int, unit: int = 2) -> ReadHolding[list[int]]:
@@ -41,7 +41,7 @@ def read(address: int, count: int, unit: int = 2) -> ReadHolding[list[int]]:
 
 
 @pytest.mark.parametrize(
-    ("request_", "said"),
+    ("request_", "text"),
     [
         (read(0x6B, 2, 0x11), "11 03 00 6b 00 02 b7 47"),
         (WriteSingle(TIMING, 0x11, 0x6B, 0x1000), "11 06 00 6b 10 00 f7 46"),
@@ -54,8 +54,8 @@ def read(address: int, count: int, unit: int = 2) -> ReadHolding[list[int]]:
         (WriteSingle(TIMING, 0, 1010, 500), "00 06 03 f2 01 f4 29 bb"),
     ],
 )
-def test_questions(request_: ReadHolding[list[int]] | WriteSingle | WriteMultiple, said: str) -> None:
-    assert request_.frame == bytes.fromhex(said)
+def test_questions(request_: ReadHolding[list[int]] | WriteSingle | WriteMultiple, text: str) -> None:
+    assert request_.frame == bytes.fromhex(text)
     assert request_.frame.hex(" ") in repr(request_)
 
 
@@ -65,10 +65,10 @@ def test_the_seeds_answers() -> None:
     assert WriteMultiple(TIMING, 0x11, 1, [10, 0x102]).answers(frame(encode(0x11, 0x10, pack((1, 2)))))
 
 
-@pytest.mark.parametrize(("said", "word"), [("02 03 02 01 00 fd d4", 0x0100), ("02 03 02 03 00 fc b4", 0x0300)])
-def test_the_first_register(said: str, word: int) -> None:
-    assert read(1000, 1).answers(frame(said))
-    assert read(1000, 1).parse([frame(said)]) == [word]
+@pytest.mark.parametrize(("text", "word"), [("02 03 02 01 00 fd d4", 0x0100), ("02 03 02 03 00 fc b4", 0x0300)])
+def test_the_first_register(text: str, word: int) -> None:
+    assert read(1000, 1).answers(frame(text))
+    assert read(1000, 1).parse([frame(text)]) == [word]
 
 
 def test_a_write_of_six_and_its_answers() -> None:
@@ -130,7 +130,7 @@ def test_only_a_single_write_is_answered_by_itself() -> None:
 
 
 @given(st.integers(1, MAX_READ), st.integers(1, MAX_READ))
-def test_answers_that_can_be_mistaken_have_the_same_look_and_no_others(one: int, other: int) -> None:
+def test_only_replies_that_can_be_confused_have_the_same_key(one: int, other: int) -> None:
     late = frame(encode(2, 3, bytes((2 * one,)) + bytes(2 * one)))
     asked = read(1000, other)
     assert asked.answers(late) == (one == other) == (asked.reply_key == late.key)
@@ -146,7 +146,7 @@ def test_exceptions_have_names(code: int) -> None:
     assert caught.value.code == code
 
 
-def test_a_unit_that_refuses_a_probe_is_there_but_not_one_a_gateway_speaks_for() -> None:
+def test_a_units_refusal_shows_it_is_there_and_a_gateways_does_not() -> None:
     probe = PresenceRead(TIMING, 2, 1000, 1, list)
     assert probe.parse([frame("02 03 02 01 00 fd d4")]) == [0x100]
     for code in (1, 4):
@@ -175,7 +175,7 @@ def test_frames_are_apart() -> None:
     assert WriteMultiple(RtuTiming.at(9_600), 2, 1, [1]).quiet_after == pytest.approx(3.5 * 11 / 9_600)
 
 
-def test_a_broadcast_is_not_answered_and_followed_by_a_longer_silence() -> None:
+def test_a_broadcast_has_no_reply_and_a_longer_silence() -> None:
     timing = RtuTiming.at(115_200, 0.2)
     for asked in (WriteSingle(timing, 0, 1010, 500), WriteMultiple(timing, 0, 1010, [500])):
         assert (asked.replies, asked.nodes) == (0, ())
@@ -183,12 +183,12 @@ def test_a_broadcast_is_not_answered_and_followed_by_a_longer_silence() -> None:
         asked.parse(())
 
 
-def test_what_is_told_leaves_time_for_an_answer_nobody_waits_for() -> None:
-    told = UnansweredWrite(RtuTiming.at(115_200), 2, 1135, [1])
-    assert told.frame == WriteMultiple(TIMING, 2, 1135, [1]).frame
-    assert (told.replies, told.nodes) == (0, ())
-    assert 0.005 < told.quiet_after < 0.01
-    told.parse(())
+def test_an_unanswered_write_leaves_time_for_a_reply() -> None:
+    write = UnansweredWrite(RtuTiming.at(115_200), 2, 1135, [1])
+    assert write.frame == WriteMultiple(TIMING, 2, 1135, [1]).frame
+    assert (write.replies, write.nodes) == (0, ())
+    assert 0.005 < write.quiet_after < 0.01
+    write.parse(())
 
 
 # Edges
@@ -221,8 +221,8 @@ def test_round_trip(unit: int, address: int, values: list[int]) -> None:
     codec = ModbusCodec("device")
     for asked in (WriteMultiple(TIMING, unit, address, values), WriteSingle(TIMING, unit, address, values[0])):
         codec.receive_data(asked.frame)
-        heard = codec.next_reply()
-        assert heard is not None
-        assert (heard.unit, heard.frame) == (unit, asked.frame)
+        reply = codec.next_reply()
+        assert reply is not None
+        assert (reply.unit, reply.frame) == (unit, asked.frame)
     reply = frame(encode(unit, 3, bytes((2 * len(values),)) + pack(values)))
     assert read(address, len(values), unit).parse([reply]) == values

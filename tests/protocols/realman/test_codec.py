@@ -148,7 +148,7 @@ def test_lines_come_out_as_they_went_in_however_they_are_cut(messages: list[dict
         b"x" * (2 * MAX_LINE) + b"\r\n",
     ],
 )
-def test_what_is_no_line_is_skipped_and_the_next_is_heard(line: bytes) -> None:
+def test_an_invalid_line_is_skipped_and_the_next_one_decoded(line: bytes) -> None:
     lines = JsonLines()
     result = []
     for at in range(0, len(line), 1000):

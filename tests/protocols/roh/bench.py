@@ -66,7 +66,7 @@ class Bench:
             for hand in devices(self.options, self.models)
         ]
         self.now = 0.0
-        self.said: list[Request[Any]] = []
+        self.sent: list[Request[Any]] = []
         """What the master said, repetitions included."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
 
@@ -77,21 +77,21 @@ class Bench:
     def exchange(self, request: Request[Any]) -> Any:
         """As the engine does it: three tries for what may be repeated."""
         for _ in range(TRIES if request.idempotent else 1):
-            self.said.append(request)
-            heard = self._heard(request)
+            self.sent.append(request)
+            received = self._replies(request)
             self.now += request.service_time
             if not request.replies:
                 return request.parse(())
-            if heard:
-                return request.parse(heard)
+            if received:
+                return request.parse(received)
         raise ReplyTimeout("no answer", request=request)
 
-    def _heard(self, request: Request[Any]) -> list[Frame]:
-        said = [reply.data for hand in self.devices for reply in hand.handle(question(request.frame), self.now)]
-        if not said or self.loses(request):
+    def _replies(self, request: Request[Any]) -> list[Frame]:
+        sent = [reply.data for hand in self.devices for reply in hand.handle(question(request.frame), self.now)]
+        if not sent or self.loses(request):
             return []
-        assert len(said) == 1
-        reply = answer(said[0])
+        assert len(sent) == 1
+        reply = answer(sent[0])
         return [reply] if request.answers(reply) else []
 
     def run(self, plan: Plan[R]) -> R:
@@ -99,8 +99,8 @@ class Bench:
 
     def frames(self) -> list[str]:
         """What was said since the last call, in words."""
-        said, self.said = self.said, []
-        return [ModbusCodec().describe(request.frame, sent=True) for request in said]
+        sent, self.sent = self.sent, []
+        return [ModbusCodec().describe(request.frame, sent=True) for request in sent]
 
     def after(self, seconds: float) -> Bench:
         self.now += seconds
@@ -140,25 +140,27 @@ def hand_of(name: str = "v2", unit: int = 2) -> RohDevice:
     return RohDevice(packaged_models()[name], unit)
 
 
-def tell(hand: RohDevice, function: int, data: bytes, *, to: int | None = None, now: float = 0.0) -> Frame | None:
+def ask_device(hand: RohDevice, function: int, data: bytes, *, to: int | None = None, now: float = 0.0) -> Frame | None:
     """What the hand answers, if it does."""
     replies = hand.handle(question(encode(hand.node if to is None else to, function, data)), now)
     assert len(replies) <= 1
     return answer(replies[0].data) if replies else None
 
 
-def look(hand: RohDevice, address: int, count: int = 1, *, now: float = 0.0) -> list[int]:
+def read_registers(hand: RohDevice, address: int, count: int = 1, *, now: float = 0.0) -> list[int]:
     """What is read there; an exception is an empty list."""
-    reply = tell(hand, 3, pack((address, count)), now=now)
+    reply = ask_device(hand, 3, pack((address, count)), now=now)
     assert reply is not None
     return unpack(reply.data[1:])
 
 
-def put(hand: RohDevice, address: int, values: Sequence[int] | int, *, now: float = 0.0, to: int | None = None) -> int | None:
+def write_registers(
+    hand: RohDevice, address: int, values: Sequence[int] | int, *, now: float = 0.0, to: int | None = None
+) -> int | None:
     """0: taken; else the exception; None: no answer."""
     some = [values] if isinstance(values, int) else list(values)
     data = pack((address, len(some))) + bytes((2 * len(some),)) + pack(some)
-    reply = tell(hand, 0x10, data, now=now, to=to)
+    reply = ask_device(hand, 0x10, data, now=now, to=to)
     if reply is None:
         return None
     return reply.data[0] if reply.function & 0x80 else 0

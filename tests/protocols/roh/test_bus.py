@@ -75,7 +75,7 @@ async def move(bus: BusService, **goals: float) -> dict[str, Outcome]:
 
 
 @virtual
-async def test_a_hand_is_met_enabled_moved_and_stopped() -> None:
+async def test_a_hand_is_identified_enabled_moved_and_stopped() -> None:
     async with running(HAND) as (bus, hands, events):
         for name in HAND:
             await bus.motion.enable(name)
@@ -123,7 +123,7 @@ def test_every_value_is_right_or_a_typed_error(name: str) -> None:
 
 
 @virtual
-async def test_a_hand_slower_than_the_deadline_gives_no_value_of_another_time() -> None:
+async def test_a_late_reply_of_a_slow_hand_is_not_used() -> None:
     async with running({"a": TWO["a"]}, timeout_ms=15) as (bus, hands, _):
         right = 0
         for number in range(2000):
@@ -152,7 +152,7 @@ async def test_all_fingers_of_a_hand_that_restarts_are_disabled() -> None:
 
 
 @virtual
-async def test_a_map_that_is_not_the_pinned_one_is_said_and_refused() -> None:
+async def test_a_map_that_is_not_the_pinned_one_is_reported_and_refused() -> None:
     async with running({"a": TWO["a"]}, units={2: {"model": "v1"}}) as (bus, hands, events):
         hands[0].poke("protocol_version", 0, 0x0200)
         identity = await bus.identify("a")
@@ -165,13 +165,13 @@ async def test_a_map_that_is_not_the_pinned_one_is_said_and_refused() -> None:
 
 
 @virtual
-async def test_a_refusal_is_told_with_its_reason_and_without_if_the_line_goes_down_meanwhile() -> None:
+async def test_a_refusal_has_its_reason_unless_the_line_goes_down() -> None:
     async with running({"a": TWO["a"]}) as (bus, hands, _):
         hands[0].refuses_reads_while_busy, hands[0].state, hands[0]._ready = True, "init", 99.0
         with pytest.raises(DeviceError, match="it is still initialising") as caught:
             await bus.read_register("a", "stall_speed")
         assert caught.value.code == 4
-        told, refused = str(caught.value), bus.stats.turns.count
+        message, refused = str(caught.value), bus.stats.turns.count
         reading = asyncio.create_task(bus.read_register("a", "stall_speed"))
         for _ in range(1000):
             await asyncio.sleep(0.0005)
@@ -181,24 +181,24 @@ async def test_a_refusal_is_told_with_its_reason_and_without_if_the_line_goes_do
         with pytest.raises(DeviceError) as caught:
             await reading
         assert caught.value.code == 4
-        assert told.startswith(str(caught.value) + "; ")
+        assert message.startswith(str(caught.value) + "; ")
 
 
 @virtual
 async def test_silence_stands_between_frames() -> None:
     """3.5 characters; 1.75 ms above 19200 baud."""
-    heard: list[tuple[bool, float]] = []
+    results: list[tuple[bool, float]] = []
     async with running({"a": TWO["a"]}) as (bus, _, _):
-        bus.master.trace = lambda sent, data, now: heard.append((sent, now))
+        bus.master.trace = lambda sent, data, now: results.append((sent, now))
         for _ in range(20):
             await bus.read_register("a", "pos")
-    answered = [now for sent, now in heard if not sent]
-    asked = [now for sent, now in heard if sent]
+    answered = [now for sent, now in results if not sent]
+    asked = [now for sent, now in results if sent]
     assert len(asked) > 20
     assert all(min(now - before for before in answered if before <= now) >= 0.00175 - 1e-9 for now in asked[1:])
 
 
-def test_the_load_of_a_line_is_told_before_it_is_opened() -> None:
+def test_the_bandwidth_of_a_line_is_counted_before_it_is_opened() -> None:
     options = bus_options(HAND, poll={"feedback": 20}, goal_rate=20)
     driver = DEFINITION.driver(options, DEFINITION.models(options, Path()))
     load = line_bandwidth(options, driver, LineTraits(options.baudrate))

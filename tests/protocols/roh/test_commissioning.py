@@ -23,15 +23,15 @@ def twin() -> Bench:
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_a_new_unit_is_saved_and_looked_for(answers: bool) -> None:
+def test_a_new_unit_is_saved_and_read_back(answers: bool) -> None:
     bench = twin()
     bench.hand.answers_restart = answers
     assert bench.run(bench.driver.commissioning.set_id(2, 7)) == Change(2, "id", 7, saved=True, pending_reboot=False)
     assert bench.hand.node == 7
-    said = bench.frames()
-    assert said[0] == "unit 7 READ 1000"
-    assert said.count("unit 2 WRITE 1005 = 7") == 1
-    assert set(said[-1:]) == {"unit 7 READ 1005"}
+    frames = bench.frames()
+    assert frames[0] == "unit 7 READ 1000"
+    assert frames.count("unit 2 WRITE 1005 = 7") == 1
+    assert set(frames[-1:]) == {"unit 7 READ 1005"}
 
 
 def test_a_unit_that_is_taken_or_that_cannot_be_is_refused() -> None:
@@ -56,13 +56,15 @@ def test_who_answers_at_the_new_unit_must_be_it() -> None:
         plan.send(3)
 
 
-def test_commands_are_said_once() -> None:
+def test_commands_are_sent_once() -> None:
     bench = twin()
     do = bench.driver.commissioning.command
-    for plan, place in ((do(2, "zero_force"), 1016), (do(2, "power_off"), 1015), (do(2, "restart"), 1014)):
+    for plan, address in ((do(2, "zero_force"), 1016), (do(2, "power_off"), 1015), (do(2, "restart"), 1014)):
         bench.after(9)
         bench.run(plan)
-        assert [entry for entry in bench.frames() if "WRITE" in entry] == [f"unit 2 WRITE {place} = {0 if place == 1014 else 1}"]
+        assert [frame for frame in bench.frames() if "WRITE" in frame] == [
+            f"unit 2 WRITE {address} = {0 if address == 1014 else 1}"
+        ]
     bench.after(9).run(do(2, "recalibrate", bench.hand.key))
     assert bench.hand.state == "calibration"
     with pytest.raises(DeviceError, match="it does not take that value"):
@@ -99,7 +101,7 @@ def test_firmware_update_ends_the_talk() -> None:
         bench.exchange(bench.driver.ping(2))
 
 
-def test_a_map_without_the_register_cannot_be_told() -> None:
+def test_a_command_needs_a_map_with_its_register() -> None:
     bench = Bench(maps={2: "legacy"})
     with pytest.raises(NotSupported, match="map legacy has no register reset"):
         bench.run(bench.driver.commissioning.command(2, "restart"))

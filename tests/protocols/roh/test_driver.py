@@ -36,19 +36,19 @@ def test_it_is_a_driver() -> None:
 
 
 @MAPS
-def test_the_map_is_told_by_the_first_registers(name: str) -> None:
+def test_the_first_registers_tell_the_map(name: str) -> None:
     bench = bench_of(name)
-    seen = bench.run(bench.driver.identify("index"))
+    result = bench.run(bench.driver.identify("index"))
     products = {"legacy": "ROH-A001 or A002", "v1": "ROH-A001 or A002", "v2": "ROH-AP001"}
-    assert (seen.model, seen.product, seen.mode, seen.notes) == (name, products[name], "position", ())
-    assert seen.firmware == {"legacy": "3.0.68", "v1": "3.1.309", "v2": "3.1.155"}[name]
+    assert (result.model, result.product, result.mode, result.notes) == (name, products[name], "position", ())
+    assert result.firmware == {"legacy": "3.0.68", "v1": "3.1.309", "v2": "3.1.155"}[name]
     assert bench.frames() == ["unit 2 READ 1000 to 1003"]
     assert bench.run(bench.driver.inspect(2)).model == name
     assert bench.driver.hands[2].map.name == name
     assert bench.driver.fault_names("index", None) == ()
 
 
-def test_who_is_not_configured_can_be_looked_at() -> None:
+def test_a_hand_that_is_not_configured_can_be_inspected() -> None:
     bench = Bench({}, maps={})
     bench.devices = Bench().devices
     assert bench.run(bench.driver.inspect(2)).model == "v2"
@@ -57,18 +57,18 @@ def test_who_is_not_configured_can_be_looked_at() -> None:
 
 
 def refuses(bench: Bench, why: str) -> None:
-    """Nothing is written, and it is said why."""
-    seen = bench.run(bench.driver.identify("index"))
-    assert why in seen.notes[0]
+    """Nothing is written, and each verb says why."""
+    result = bench.run(bench.driver.identify("index"))
+    assert why in result.notes[0]
     assert bench.driver.fault_names("index", None) == ("register_map",)
     with pytest.raises(DeviceError, match=why):
         bench.run(bench.driver.enable("index"))
     with pytest.raises(DeviceError, match=why):
         bench.driver.check_goal(goal("index", 50))
-    result = bench.move(goal("index", 50))["index"]
-    assert isinstance(result, DeviceError)
-    assert why in result.message
-    assert result.servo == "index"
+    error = bench.move(goal("index", 50))["index"]
+    assert isinstance(error, DeviceError)
+    assert why in error.message
+    assert error.servo == "index"
     with pytest.raises(DeviceError, match=why):
         bench.write("index", "beep_period", 0.1)
     assert bench.hand.written == []
@@ -89,7 +89,7 @@ def test_the_pinned_map_is_fine(name: str) -> None:
 
 
 @pytest.mark.parametrize("word", [0x0000, 0x0400, 0x0201, 0xFFFF])
-def test_a_hand_with_no_known_map_is_not_written_to(word: int) -> None:
+def test_a_hand_with_an_unknown_map_is_not_written_to(word: int) -> None:
     bench = Bench()
     bench.hand.poke("protocol_version", 0, word)
     bench.hand.poke("fw_version", 0, 0x0402)
@@ -183,7 +183,7 @@ def test_a_fence_that_was_not_answered_is_followed_by_another() -> None:
     assert len(bench.frames()) == 2
 
 
-def test_a_hand_that_initialises_answers_a_fence_when_nothing_else_is_under_way() -> None:
+def test_a_refusal_answers_a_fence_if_no_other_read_is_under_way() -> None:
     bench = Bench()
     bench.hand.max_registers = 0
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
@@ -222,7 +222,7 @@ def test_a_hand_that_initialises_has_restarted(busy: bool) -> None:
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)) is not busy
 
 
-def test_another_hand_in_its_place_is_asked_anew() -> None:
+def test_a_replaced_hand_is_asked_for_its_map_again() -> None:
     bench = Bench().enable("index")
     bench.devices = bench_of("v1").devices
     assert not bench.run(bench.driver.fence(2, [], bench.driver.nodes))

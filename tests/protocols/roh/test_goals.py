@@ -29,9 +29,9 @@ def test_six_fingers_are_one_write() -> None:
     bench = Bench().enable()
     goals = [goal(channel, 100 if channel == "thumb_rotation" else 0) for channel in CHANNELS]
     assert bench.move(*goals) == dict.fromkeys(CHANNELS, "acked")
-    assert [request.frame.hex(" ") for request in bench.said] == ["02 10 04 6f 00 06 0c" + " 00" * 10 + " ff ff 60 3e"]
+    assert [request.frame.hex(" ") for request in bench.sent] == ["02 10 04 6f 00 06 0c" + " 00" * 10 + " ff ff 60 3e"]
     bench.after(2)
-    assert [round(digit.position) for digit in bench.hand.fingers] == [0] * 5 + [65535]
+    assert [round(finger.position) for finger in bench.hand.fingers] == [0] * 5 + [65535]
 
 
 def test_only_what_was_asked_for_is_written() -> None:
@@ -45,7 +45,7 @@ def test_writes_keep_to_what_the_line_carries(limit: int, writes: int) -> None:
     bench = Bench(max_write=limit).enable()
     bench.move(*all_fingers(100))
     assert len(bench.frames()) == writes
-    assert max(len(request.frame) for request in bench.said or [bench.driver.unused()]) <= 9 + 2 * limit
+    assert max(len(request.frame) for request in bench.sent or [bench.driver.unused()]) <= 9 + 2 * limit
 
 
 def test_degrees_and_percent_have_registers_of_their_own() -> None:
@@ -106,7 +106,7 @@ def test_a_speed_is_written_before_the_target_and_once() -> None:
     assert bench.frames() == ["unit 2 WRITE 1126 = 65535", "unit 2 WRITE 1136 = 0"]
 
 
-def test_the_configs_speed_and_effort_are_what_a_goal_has_that_names_none() -> None:
+def test_a_goal_without_speed_and_effort_has_those_of_the_config() -> None:
     servos = {
         "index": {**HAND["index"], "speed": 25, "max_speed": 80, "torque_limit": 50},
         "middle": {**HAND["middle"], "max_speed": 75},
@@ -190,7 +190,7 @@ def test_beyond_it(wanted: ServoGoal, error: str) -> None:
 
 
 @pytest.mark.parametrize(("value", "fine"), [(100.22, True), (178.37, True), (100.21, False), (178.38, False)])
-def test_angles_the_finger_does_not_reach_are_refused(value: float, fine: bool) -> None:
+def test_angles_beyond_the_fingers_range_are_refused(value: float, fine: bool) -> None:
     """The hand would silently go to its limit."""
     bench = Bench({"index": {**HAND["index"], "unit": "deg"}}).enable()
     if fine:
@@ -201,7 +201,7 @@ def test_angles_the_finger_does_not_reach_are_refused(value: float, fine: bool) 
 
 
 @given(st.dictionaries(st.sampled_from(CHANNELS), st.floats(0, 100), min_size=1), st.integers(1, 10))
-def test_whatever_is_asked_for_stands_in_the_targets_and_nothing_else(wanted: dict[str, float], limit: int) -> None:
+def test_the_targets_hold_exactly_what_was_asked_for(wanted: dict[str, float], limit: int) -> None:
     bench = Bench(max_write=limit).enable()
     bench.move(*(goal(name, value) for name, value in wanted.items()))
     assert dict(bench.hand.written) == {1135 + list(HAND).index(name): round(value * 655.35) for name, value in wanted.items()}

@@ -197,8 +197,8 @@ def test_a_map_that_lacks_a_part_is_refused(tmp_path: Path) -> None:
 
 def test_which_maps_fit_what_a_hand_says() -> None:
     fits = {
-        words: [name for name, model in packaged_models().items() if model.fits(words)]
-        for words in ((0x0100, 0x0301), (0x0200, 0x0301), (0x0300, 68), (0x0100, 0x0201), (0x0100,), (0x0400, 0x0301))
+        registers: [name for name, model in packaged_models().items() if model.fits(registers)]
+        for registers in ((0x0100, 0x0301), (0x0200, 0x0301), (0x0300, 68), (0x0100, 0x0201), (0x0100,), (0x0400, 0x0301))
     }
     assert list(fits.values()) == [["v1"], ["v2"], ["legacy"], [], ["v1"], []]
     assert packaged_models()["v1"].goal_ranges["torque_limit"] == (0.0, 100.0)

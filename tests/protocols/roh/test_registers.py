@@ -22,10 +22,10 @@ READ = 3
 @MAPS
 def test_feedback_is_one_read_and_health_the_fewest(name: str) -> None:
     bench = bench_of(name).enable()
-    for number, digit in enumerate(bench.hand.fingers):
-        digit.position = 65535 * number / 5
-        digit.current = 100 * number
-        digit.status = number
+    for number, finger in enumerate(bench.hand.fingers):
+        finger.position = 65535 * number / 5
+        finger.current = 100 * number
+        finger.status = number
     polls = bench.driver.polls({"feedback": 50, "health": 5})
     assert [(poll.name, poll.hz, poll.nodes) for poll in polls] == [
         ("feedback", 50, (2,)),
@@ -56,7 +56,7 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
     for servo in CHANNELS:
         bench.run(bench.driver.enable(servo))
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
-    assert max(request.frame[5] for request in bench.said if request.frame[1] == READ) == 12
+    assert max(request.frame[5] for request in bench.sent if request.frame[1] == READ) == 12
     with pytest.raises(NotSupported, match=r"has 18 words, one read on this line 12: read it in parts, 2000:12"):
         bench.driver.read_register("thumb_bend", "force_ex")
     with pytest.raises(LimitError, match="LEN 1 to 12"):
@@ -65,7 +65,7 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
 
 
 @MAPS
-def test_state_is_place_and_status_in_one_read(name: str) -> None:
+def test_the_state_is_position_and_status_in_one_read(name: str) -> None:
     bench = bench_of(name).enable()
     bench.hand.fingers[2].position, bench.hand.fingers[2].status = 65535, 5
     request = bench.driver.read_state("middle")
@@ -151,7 +151,7 @@ def test_registers_of_other_verbs_are_not_written_by_name() -> None:
     assert bench.frames() == []
 
 
-def test_what_is_saved_or_done_each_time_is_never_said_again() -> None:
+def test_a_write_that_is_saved_or_has_an_effect_is_not_repeated() -> None:
     bench = Bench().enable()
     bench.loses = lambda request: request.frame[1] == 16
     for name, keys in (("beep_switch", {"persist": True}), ("beep_period", {}), ("speed", {})):
@@ -170,10 +170,10 @@ def test_a_value_that_does_not_read_back_was_not_taken() -> None:
         plan.send([7])
 
 
-def test_single_registers_are_written_with_the_single_function_on_request() -> None:
+def test_one_register_is_written_by_0x06_on_request() -> None:
     bench = Bench(single_write="single").enable()
     bench.write("index", "speed", 50)
-    assert isinstance(bench.said[0], WriteSingle)
+    assert isinstance(bench.sent[0], WriteSingle)
     bench.frames()
     bench.move(goal("index", 10), goal("middle", 10))
     assert "unit 2 WRITE 1136 to 1137 = 6554 6554" in bench.frames()

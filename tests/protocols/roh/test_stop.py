@@ -41,7 +41,7 @@ def test_where_limp_was_wanted_it_holds_and_says_so() -> None:
     assert "no torque command" in bench.run(bench.driver.disable("ring")).detail
 
 
-def test_a_hand_that_does_not_answer_is_told_twice_where_it_was_seen() -> None:
+def test_a_silent_hand_is_sent_its_last_positions_twice() -> None:
     bench = three_hands().enable()
     gone = [
         target("legacy_index", position=50.0, reachable=False),

@@ -12,7 +12,7 @@ from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.aborts import ABORTS
 from servobus.protocols.kst.codec import FACTORY_ID, REQUEST_SIZES, Command, encode, encode_position
 from servobus.protocols.kst.model import load_models, packaged_model
-from tests.protocols.kst.bench import bus_options, device_of, frame_of, tell
+from tests.protocols.kst.bench import ask_device, bus_options, device_of, frame_of
 
 
 def test_it_is_a_device_as_it_leaves_the_factory() -> None:
@@ -23,15 +23,15 @@ def test_it_is_a_device_as_it_leaves_the_factory() -> None:
 def test_it_hears_only_its_own_address_and_commands() -> None:
     device = device_of(servo_id=5)
     for address in range(256):
-        assert (tell(device, Command.READ_ID, to=address) is not None) is (address == 5)
-    answered = [code for code in range(256) if tell(device, code, b"save") is not None]
+        assert (ask_device(device, Command.READ_ID, to=address) is not None) is (address == 5)
+    answered = [code for code in range(256) if ask_device(device, code, b"save") is not None]
     assert answered == sorted(set(REQUEST_SIZES) - {Command.SAVE})
 
 
 def test_it_does_not_answer_replies() -> None:
     """Own echo on the line must not start a conversation."""
     device = device_of()
-    assert all(tell(device, code) is None for code in range(0x40, 0x100))
+    assert all(ask_device(device, code) is None for code in range(0x40, 0x100))
 
 
 @pytest.mark.parametrize("code", ABORTS)
@@ -41,7 +41,7 @@ def test_it_refuses_with_any_abort_code_on_demand(code: int, order: str) -> None
     device.refuses = dict.fromkeys(REQUEST_SIZES, code)
     device.sdo_order = order
     for command in REQUEST_SIZES:
-        reply = tell(device, command, b"save")
+        reply = ask_device(device, command, b"save")
         assert reply is not None
         assert (reply.code, reply.data[:4]) == (0xC0 + command, code.to_bytes(4, "big" if order == "be" else "little"))
     assert (device.goal, device.node) == (0, FACTORY_ID)
@@ -61,7 +61,7 @@ def test_it_refuses_with_any_abort_code_on_demand(code: int, order: str) -> None
     ],
 )
 def test_values_it_cannot_take_are_refused(command: Command, data: bytes, code: int | None) -> None:
-    reply = tell(device_of(), command, data)
+    reply = ask_device(device_of(), command, data)
     assert reply is not None
     if code is None:
         assert (reply.code, reply.data[: len(data)]) == (0x40 + command, data)
@@ -72,50 +72,50 @@ def test_values_it_cannot_take_are_refused(command: Command, data: bytes, code: 
 def test_status_and_version_bytes() -> None:
     device = device_of()
     device.status_bytes = b"\x12\x34"
-    assert tell(device, Command.READ_STATUS) == frame_of(encode(FACTORY_ID, 0x50, b"\x12\x34"))
-    assert tell(device, Command.READ_VERSION) == frame_of(encode(FACTORY_ID, 0x5A, b"1.00"))
+    assert ask_device(device, Command.READ_STATUS) == frame_of(encode(FACTORY_ID, 0x50, b"\x12\x34"))
+    assert ask_device(device, Command.READ_VERSION) == frame_of(encode(FACTORY_ID, 0x5A, b"1.00"))
 
 
 def test_it_moves_at_a_finite_speed_and_stays_where_it_was_sent() -> None:
     device = device_of(position=-100)
     device.speed = 1000.0
-    tell(device, Command.SET_POSITION, encode_position(400), now=1.0)
+    ask_device(device, Command.SET_POSITION, encode_position(400), now=1.0)
     places = []
     for now in (1.1, 1.2, 1.1, 1.5, 9.0):
         device.advance(now)
         places.append(round(device.position))
     assert places == [0, 100, 100, 400, 400]
-    tell(device, Command.SET_POSITION, encode_position(-400), now=9.0)
-    assert tell(device, Command.READ_POSITION, now=9.1) == frame_of(encode(FACTORY_ID, 0x59, encode_position(300)))
+    ask_device(device, Command.SET_POSITION, encode_position(-400), now=9.0)
+    assert ask_device(device, Command.READ_POSITION, now=9.1) == frame_of(encode(FACTORY_ID, 0x59, encode_position(300)))
 
 
-def test_only_set_position_is_obeyed_as_a_broadcast_and_never_answered() -> None:
+def test_only_a_position_is_obeyed_as_a_broadcast_and_not_answered() -> None:
     """K2, K3."""
     device = device_of(servo_id=5)
     for command in REQUEST_SIZES:
-        assert tell(device, command, b"\x2c\x01", to=0) is None
+        assert ask_device(device, command, b"\x2c\x01", to=0) is None
     assert (device.goal, device.node) == (300, 5)
     device.reboot(0.0)
     assert (device.node, device.baudrate) == (5, 512_000)
 
 
-def test_what_was_not_saved_is_lost_by_a_restart_and_silence_goes_with_it() -> None:
+def test_a_restart_loses_unsaved_settings_and_is_silent_meanwhile() -> None:
     device = device_of(position=500)
-    tell(device, Command.SET_ID, b"\5")
-    tell(device, Command.SET_BAUD, b"\0")
-    assert tell(device, Command.SAVE, b"sabe") is None
+    ask_device(device, Command.SET_ID, b"\5")
+    ask_device(device, Command.SET_BAUD, b"\0")
+    assert ask_device(device, Command.SAVE, b"sabe") is None
     device.reboot(1.0)
-    assert tell(device, Command.READ_ID, now=1.0 + packaged_model().reboot_s - 1e-6) is None
-    assert tell(device, Command.READ_ID, now=1.0 + packaged_model().reboot_s) is not None
+    assert ask_device(device, Command.READ_ID, now=1.0 + packaged_model().reboot_s - 1e-6) is None
+    assert ask_device(device, Command.READ_ID, now=1.0 + packaged_model().reboot_s) is not None
     assert (device.node, device.baudrate, device.goal) == (FACTORY_ID, 512_000, 0)
 
 
 def test_settings_can_count_at_once() -> None:
     """K5."""
     device = device_of(immediate=True)
-    assert tell(device, Command.SET_ID, b"\5") == frame_of(encode(FACTORY_ID, 0x48, b"\5"))
+    assert ask_device(device, Command.SET_ID, b"\5") == frame_of(encode(FACTORY_ID, 0x48, b"\5"))
     assert device.node == 5
-    assert tell(device, Command.SET_BAUD, b"\0") == frame_of(encode(5, 0x46, b"\0"))
+    assert ask_device(device, Command.SET_BAUD, b"\0") == frame_of(encode(5, 0x46, b"\0"))
     assert device.baudrate == 9600
 
 
@@ -123,7 +123,7 @@ def test_a_save_that_is_answered() -> None:
     """K4."""
     device = device_of()
     device.answers_save = True
-    assert tell(device, Command.SAVE, b"save") == frame_of(encode(FACTORY_ID, 0x4F))
+    assert ask_device(device, Command.SAVE, b"save") == frame_of(encode(FACTORY_ID, 0x4F))
 
 
 def test_dead_and_late() -> None:
@@ -132,10 +132,10 @@ def test_dead_and_late() -> None:
     (reply,) = device.handle(frame_of(encode(FACTORY_ID, Command.READ_ID)), 0.0)
     assert (reply.delay, reply.late) == (device.delay, 0.5)
     device.dead = True
-    assert tell(device, Command.READ_ID) is None
+    assert ask_device(device, Command.READ_ID) is None
 
 
-def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> None:
+def test_simulated_servos_begin_at_zero_and_follow_the_options() -> None:
     options = bus_options(
         {"pan": {"id": 1, "zero": 120}},
         baudrate=9600,
@@ -156,7 +156,7 @@ def test_the_servos_of_a_bus_stand_at_their_zero_and_follow_its_options() -> Non
         assert (servo.position, servo.sdo_order, servo.answers_save, servo.immediate) == (0, "be", False, False)
 
 
-def test_the_entry_speaks_for_the_folder() -> None:
+def test_the_definition_has_every_part() -> None:
     assert DEFINITION.scan_ids == range(1, 255)
     frame = encode(5, 0x58, b"\5")
     assert DEFINITION.node_of(frame) == 5

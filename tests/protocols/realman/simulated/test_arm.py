@@ -67,13 +67,13 @@ def test_everything_that_fails_is_one_bit(generation: int, message: dict[str, An
     assert [value for key, value in reply.items() if key.endswith("_state")] == [False]
 
 
-def test_the_old_commands_are_not_known_to_the_new_arm_nor_the_other_way_round() -> None:
+def test_each_generation_answers_only_its_own_commands() -> None:
     assert arm_of(4).handle(dialect(3, 1).read(2, 1000, 1).message) is None
     assert arm_of(3).handle(dialect(4, 1).read(2, 1000, 1).message) is None
     assert arm_of().handle({"command": 5}) is None
 
 
-def test_its_portrait() -> None:
+def test_it_describes_itself() -> None:
     arm = arm_of()
     assert all(arm.handle({"command": command}) == reply for command, reply in DESCRIPTION.items())
     assert (arm_of(2).handle({"command": "get_arm_software_info"})) is None
