@@ -100,17 +100,26 @@ class KstCommissioning(Commissioning):
         change = self.pending.get(node)
         return (node, change.value) if change is not None and change.what == "id" else (node,)
 
+    def ask_new_id(self, node: int) -> Plan[int | None]:
+        """Return the plan that ends a saved change of this node's id if the new id answers. It returns that id, or None."""
+        change = self.pending.get(node)
+        if change is None or change.what != "id" or not change.saved:
+            return None
+        return (yield from self._confirm(change, change.value))
+
     def _restarted(self, change: Change) -> Plan[int | None]:
-        candidates = (change.value, change.node) if change.what == "id" and change.saved else (change.node,)
-        for node in candidates:
-            try:
-                reported = yield from ask(self._read_id(node))
-            except (ReplyTimeout, DeviceError):
-                continue
-            if reported == node:
-                self.pending.pop(change.node, None)
-                return node
-        return None
+        return (yield from self.ask_new_id(change.node)) or (yield from self._confirm(change, change.node))
+
+    def _confirm(self, change: Change, node: int) -> Plan[int | None]:
+        """End the change if this id answers for itself."""
+        try:
+            reported = yield from ask(self._read_id(node))
+        except (ReplyTimeout, DeviceError):
+            return None
+        if reported != node:
+            return None
+        self.pending.pop(change.node, None)
+        return node
 
     def _refuse_second(self, node: int) -> None:
         if node in self.pending:

@@ -65,15 +65,16 @@ class KstDriver(Driver):
     def fence(self, node: int, avoid: Sequence[Hashable], enabled: Collection[str]) -> Plan[bool]:
         """Send a fence, then read the position of an enabled servo: outside its travel range it has restarted.
 
-        Each read has only one form. So the fences take turns, and a position read without a reply may be under way as well.
+        Each read has only one form. So the fences take turns, and a position read without a reply may be under way as well. A
+        node that is silent may answer at its saved new id, so that is asked too.
         """
-        return fence.fence(
-            partial(self._fence, node, enabled),
-            FENCES,
-            avoid,
-            after_failure=(Command.READ_POSITION,),
-            retry_on=ReplyTimeout,
-        )
+        attempt = partial(self._fence, node, enabled)
+        try:
+            position = (Command.READ_POSITION,)
+            return (yield from fence.fence(attempt, FENCES, avoid, after_failure=position, retry_on=ReplyTimeout))
+        except ReplyTimeout:
+            yield from self.commissioning.ask_new_id(node)
+            raise
 
     def _fence(self, node: int, enabled: Collection[str], command: Command) -> Plan[bool]:
         yield from ask(Fence(self.settings, node, command, self.commissioning.own_ids(node)))
