@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import click
 
 import servobus
+from servobus.cli.output import accept_any_encoding, echo
 from servobus.errors import ServobusError
 
 
-class Entry(NamedTuple):
+class CommandInfo(NamedTuple):
     """One line of the table of commands."""
 
     module: str
@@ -27,28 +28,28 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {
-    "run": Entry("service", "Own the ports of CONFIG as a daemon, and serve other programs."),
-    "sim": Entry("service", "Serve the servos of CONFIG, simulated, as serial ports."),
-    "demo": Entry("demo", "Stream goals to 20 simulated servos on four lines."),
-    "check": Entry("offline", "Validate a config and print the load of each line."),
-    "schema": Entry("offline", "Print the JSON Schema of configs, for editors."),
-    "decode": Entry("offline", "Explain the frames in some bytes."),
-    "ports": Entry("offline", "List the serial ports of this machine."),
-    "scan": Entry("scan", "Search a line for servos."),
-    "ping": Entry("registers", "Ask servos whether they answer."),
-    "read": Entry("registers", "Read the state of servos, or one register of a servo."),
-    "write": Entry("registers", "Write registers of a servo, and read them back."),
-    "monitor": Entry("monitor", "Show the state of servos, live."),
-    "stats": Entry("monitor", "Print the counters and times of each line."),
-    "move": Entry("move", "Move servos and wait until they arrive."),
-    "enable": Entry("move", "Switch torque on; each servo holds its present position."),
-    "disable": Entry("move", "Switch torque off, and confirm it by reading back."),
-    "stop": Entry("move", "E-stop all servos of all buses."),
-    "clear": Entry("move", "Release the e-stop of a daemon."),
-    "set-id": Entry("maintenance", "Change the id of a servo."),
-    "set-baud": Entry("maintenance", "Change the baud rate of a servo."),
-    "command": Entry("maintenance", "Send a maintenance command to a servo or a hand."),
-    "install-service": Entry("install", "Print or write the files of a system service."),
+    "run": CommandInfo("service", "Own the ports of CONFIG as a daemon, and serve other programs."),
+    "sim": CommandInfo("service", "Serve the servos of CONFIG, simulated, as serial ports."),
+    "demo": CommandInfo("service", "Stream goals to 20 simulated servos on four lines."),
+    "check": CommandInfo("offline", "Validate a config and print the load of each line."),
+    "schema": CommandInfo("offline", "Print the JSON Schema of configs, for editors."),
+    "decode": CommandInfo("offline", "Explain the frames in some bytes."),
+    "ports": CommandInfo("offline", "List the serial ports of this machine."),
+    "scan": CommandInfo("scan", "Search a line for servos."),
+    "ping": CommandInfo("registers", "Ask servos whether they answer."),
+    "read": CommandInfo("registers", "Read the state of servos, or one register of a servo."),
+    "write": CommandInfo("registers", "Write registers of a servo, and read them back."),
+    "monitor": CommandInfo("monitor", "Show the state of servos, live."),
+    "stats": CommandInfo("monitor", "Print the counters and times of each line."),
+    "move": CommandInfo("move", "Move servos and wait until they arrive."),
+    "enable": CommandInfo("move", "Switch torque on; each servo holds its present position."),
+    "disable": CommandInfo("move", "Switch torque off, and confirm it by reading back."),
+    "stop": CommandInfo("move", "E-stop all servos of all buses."),
+    "clear": CommandInfo("move", "Release the e-stop of a daemon."),
+    "set-id": CommandInfo("maintenance", "Change the id of a servo."),
+    "set-baud": CommandInfo("maintenance", "Change the baud rate of a servo."),
+    "command": CommandInfo("maintenance", "Send a maintenance command to a servo or a hand."),
+    "install-service": CommandInfo("install", "Print or write the files of a system service."),
 }
 INTERRUPTED = 130
 
@@ -76,12 +77,12 @@ class Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, entry.help) for name, entry in COMMANDS.items()])
+            formatter.write_dl([(name, info.help) for name, info in COMMANDS.items()])
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
-        click.echo(servobus.__version__)
+        echo(servobus.__version__)
         ctx.exit()
 
 
@@ -114,16 +115,17 @@ def main(arguments: list[str] | None = None) -> None:
 
 def status_of(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit status. An error becomes one message on standard error."""
+    accept_any_encoding()
     try:
         result: Any = cli.main(arguments, prog_name="servobus", standalone_mode=False)
     except click.ClickException as error:
         error.show()
         return error.exit_code
     except ServobusError as error:
-        click.echo(f"servobus: {error}", err=True)
+        echo(f"servobus: {error}", err=True)
         return error.exit_status
     except OSError as error:
-        click.echo(f"servobus: {error}", err=True)
+        echo(f"servobus: {error}", err=True)
         return ServobusError.exit_status
     except (KeyboardInterrupt, click.Abort):
         return INTERRUPTED

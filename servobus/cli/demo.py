@@ -1,20 +1,17 @@
-"""The main job, shown on embedded simulated lines: one caller per servo streams goals while feedback is polled."""
+"""The rig of `servobus demo`: four simulated lines, and one caller for each servo that streams goals while feedback is polled."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import click
-
-from servobus.cli.offline import loads_of
-from servobus.cli.output import Number, echo_table, emit, logs, run
-from servobus.config.loader import parse_config
+from servobus.cli.checks import line_loads
+from servobus.cli.output import echo, echo_table, emit
+from servobus.config.loader import Config, parse_config
 from servobus.errors import ServobusError
 from servobus.rig.interface import Servo
 from servobus.rig.local import LocalRig, open_rig
@@ -23,12 +20,12 @@ from servobus.values import Outcome
 GOAL_HZ = 100.0
 FEEDBACK_HZ = 50.0
 FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
-PERIOD = 4.0
-"""Seconds of one swing."""
+PERIOD_S = 4.0
+"""Duration of one swing."""
 
 
 @dataclass(frozen=True)
-class Line:
+class DemoBus:
     """A bus of the demo; its servos swing about `middle`, in their unit."""
 
     protocol: str
@@ -38,104 +35,94 @@ class Line:
     swing: float = 30.0
 
 
-LINES = {
-    "arm": Line("sms", 1_000_000, [f"sts{number}: {{id: {number}, model: sts, max_speed: 300}}" for number in range(1, 7)]),
-    "base": Line("sms", 115_200, [f"sms{number}: {{id: {number}, model: sms, max_speed: 300}}" for number in range(1, 5)]),
-    "gimbal": Line("kst", 512_000, [f"kst{number}: {{id: {number}, max_speed: 300}}" for number in range(1, 5)]),
-    "hand": Line("roh", 115_200, [f"{channel}: {{id: 2, channel: {channel}}}" for channel in FINGERS], middle=50, swing=40),
+BUSES = {
+    "arm": DemoBus("sms", 1_000_000, [f"sts{number}: {{id: {number}, model: sts, max_speed: 300}}" for number in range(1, 7)]),
+    "base": DemoBus("sms", 115_200, [f"sms{number}: {{id: {number}, model: sms, max_speed: 300}}" for number in range(1, 5)]),
+    "gimbal": DemoBus("kst", 512_000, [f"kst{number}: {{id: {number}, max_speed: 300}}" for number in range(1, 5)]),
+    "hand": DemoBus("roh", 115_200, [f"{channel}: {{id: 2, channel: {channel}}}" for channel in FINGERS], middle=50, swing=40),
 }
 
 
 def config_text() -> str:
-    """The simulated rig."""
+    """The config of the demo, as YAML."""
     text = "version: 1\nbuses:\n"
-    for bus, line in LINES.items():
-        text += f"  {bus}:\n    protocol: {line.protocol}\n    port: 'sim:'\n    baudrate: {line.baudrate}\n"
+    for name, bus in BUSES.items():
+        text += f"  {name}:\n    protocol: {bus.protocol}\n    port: 'sim:'\n    baudrate: {bus.baudrate}\n"
         text += f"    poll: {{feedback: {FEEDBACK_HZ:g}}}\n    goal_rate: {GOAL_HZ:g}\n    servos:\n"
-        text += "".join(f"      {servo}\n" for servo in line.servos)
+        text += "".join(f"      {servo}\n" for servo in bus.servos)
     return text
 
 
 @dataclass(slots=True)
-class Tally:
-    """What the callers of one bus saw."""
+class GoalResults:
+    """How the goals of one bus ended."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     errors: Counter[str] = field(default_factory=Counter)
 
 
-@click.command()
-@click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="How long to stream.")
-@click.option("--json", "as_json", is_flag=True, help="For machines.")
-def demo(seconds: float, as_json: bool) -> int:
-    """Stream goals to 20 simulated servos on four lines with real wire time, and print what the lines carried.
-
-    Six STS at 1 Mbaud, four SMS at 115200 baud, four KST at 512000 and the six fingers of a ROH hand at 115200; one caller per
-    servo sends 100 goals a second, feedback is polled at 50 Hz.
-
-    Example: servobus demo --seconds 3
-    """
-    logs(logging.ERROR)
+async def stream(seconds: float, *, as_json: bool) -> int:
+    """Stream goals for some seconds and print the result. Returns the exit status."""
     config = parse_config(config_text(), "demo")
     if not as_json:
-        for name, load in loads_of(config).items():
-            options = config.buses[name]
-            verdict = (
-                "carries that"
-                if load.total <= 100
-                else "cannot carry all of that: goals are replaced by newer ones, polls are skipped"
-            )
-            click.echo(
-                f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each "
-                f"and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line; it {verdict}"
-            )
-
-    async def main() -> int:
-        async with open_rig(config) as rig:
-            await rig.enable()
-            before = rig.stats()
-            tallies = {name: Tally() for name in config.buses}
-            started = asyncio.get_running_loop().time()
-            await asyncio.gather(*(_caller(servo, tallies[rig.names[servo.name][0]], started, seconds) for servo in rig))
-            elapsed = asyncio.get_running_loop().time() - started
-            rows = {name: _row(rig, name, tally, before[name], elapsed) for name, tally in tallies.items()}
-            if as_json:
-                emit(rows)
-            else:
-                echo_table(None, ("bus", *next(iter(rows.values()))), [(name, *row.values()) for name, row in rows.items()])
-            return 1 if any(row["errors"] for row in rows.values()) else 0
-
-    return run(main)
+        _print_loads(config)
+    async with open_rig(config) as rig:
+        await rig.enable()
+        before = rig.stats()
+        results = {name: GoalResults() for name in config.buses}
+        start = asyncio.get_running_loop().time()
+        await asyncio.gather(*(_caller(servo, results[rig.names[servo.name][0]], start, seconds) for servo in rig))
+        elapsed = asyncio.get_running_loop().time() - start
+        rows = {name: _row(rig, name, result, before[name], elapsed) for name, result in results.items()}
+    if as_json:
+        emit(rows)
+    else:
+        echo_table(None, ("bus", *next(iter(rows.values()))), [(name, *row.values()) for name, row in rows.items()])
+    return 1 if any(row["errors"] for row in rows.values()) else 0
 
 
-async def _caller(servo: Servo, tally: Tally, started: float, seconds: float) -> None:
-    """Goals on a fixed grid. A goal that is not through when the next is due is replaced by it, as in any streaming caller."""
-    loop, line = asyncio.get_running_loop(), LINES[servo.name.partition("/")[0]]
+def _print_loads(config: Config) -> None:
+    for name, load in line_loads(config).items():
+        options = config.buses[name]
+        verdict = (
+            "carries that"
+            if load.total <= 100
+            else "cannot carry all of that: newer goals replace older ones, and polls are skipped"
+        )
+        echo(
+            f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each "
+            f"and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line; it {verdict}"
+        )
+
+
+async def _caller(servo: Servo, result: GoalResults, start: float, seconds: float) -> None:
+    """Sends goals on a fixed grid. A goal that has not left when the next one is due is replaced, as in any streaming caller."""
+    loop, bus = asyncio.get_running_loop(), BUSES[servo.name.partition("/")[0]]
     pending: set[asyncio.Task[None]] = set()
     for tick in range(int(seconds * GOAL_HZ)):
-        await asyncio.sleep(started + tick / GOAL_HZ - loop.time())
-        position = line.middle + line.swing * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD)
-        task = loop.create_task(_send(servo, position, tally))
+        await asyncio.sleep(start + tick / GOAL_HZ - loop.time())
+        position = bus.middle + bus.swing * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD_S)
+        task = loop.create_task(_send(servo, position, result))
         pending.add(task)
         task.add_done_callback(pending.discard)
     await asyncio.gather(*pending)
-    await asyncio.sleep(started + seconds - loop.time())
+    await asyncio.sleep(start + seconds - loop.time())
 
 
-async def _send(servo: Servo, position: float, tally: Tally) -> None:
+async def _send(servo: Servo, position: float, result: GoalResults) -> None:
     try:
         outcome = await servo.move_to(position)
     except ServobusError as error:
-        tally.errors[type(error).__name__] += 1
+        result.errors[type(error).__name__] += 1
     else:
-        tally.outcomes[outcome] += 1
+        result.outcomes[outcome] += 1
 
 
-def _row(rig: LocalRig, name: str, tally: Tally, before: dict[str, Any], seconds: float) -> dict[str, Any]:
+def _row(rig: LocalRig, name: str, result: GoalResults, before: dict[str, Any], seconds: float) -> dict[str, Any]:
     stats = rig.stats()[name]
-    goals = sum(tally.outcomes.values())
-    delivered = goals - tally.outcomes[Outcome.SUPERSEDED]
-    frames = stats["goal_turns"] - before["goal_turns"]  # a goal turn here is one frame: WRITE or SYNC WRITE
+    goals = sum(result.outcomes.values())
+    delivered = goals - result.outcomes[Outcome.SUPERSEDED]
+    frames = stats["goal_turns"] - before["goal_turns"]  # each goal turn of the demo is one frame
     feedback = stats.get("polled", 0) - before.get("polled", 0)
     servos = len(rig.config.buses[name].servos)
     return {
@@ -147,5 +134,5 @@ def _row(rig: LocalRig, name: str, tally: Tally, before: dict[str, Any], seconds
         "wire load %": stats["wire_load_percent"],
         "turn p50 ms": stats["turn_ms"]["p50"],
         "turn p99 ms": stats["turn_ms"]["p99"],
-        "errors": sum(tally.errors.values()),
+        "errors": sum(result.errors.values()),
     }

@@ -1,4 +1,4 @@
-"""`--trace` and `--dry-run`: what is on the wire, frame by frame and in words."""
+"""The printer behind `--trace` and `--dry-run`: each frame on the wire as a line of bytes and of words."""
 
 from __future__ import annotations
 
@@ -6,70 +6,76 @@ from collections.abc import Callable, Iterator, Mapping
 
 from servobus.protocols.base import Codec
 
-STALE = 0.005
-"""Seconds after which a piece of a frame is given up when something is said: its rest does not come any more."""
+STALE_S = 0.005
+"""Age in seconds at which a part of a frame is given up when the next request leaves: the rest does not come any more."""
 
 
-class Ear:
-    """What is heard on one bus comes in pieces; what people read are frames."""
+class FrameSplitter:
+    """Cuts the bytes received on one bus into frames."""
 
     def __init__(self, codec: Codec) -> None:
         self.codec = codec
-        self._heard = b""
+        self._buffer = b""
         self._last = 0.0
 
-    def hear(self, data: bytes, now: float) -> Iterator[bytes]:
-        """The frames that are whole now, and between them what was none."""
+    def receive(self, data: bytes, now: float) -> Iterator[bytes]:
+        """Yields each frame that is complete, and the bytes between frames that are not a frame."""
         self._last = now
-        self._heard += data
+        self._buffer += data
         self.codec.receive_data(data)
         while (reply := self.codec.next_reply()) is not None:
-            before, _, self._heard = self._heard.partition(reply.frame)
+            before, _, self._buffer = self._buffer.partition(reply.frame)
             if before:
                 yield before
             yield reply.frame
-        noise = len(self._heard) - self.codec.pending
+        noise = len(self._buffer) - self.codec.pending
         if noise > 0:
-            yield self._heard[:noise]
-            self._heard = self._heard[noise:]
+            yield self._buffer[:noise]
+            self._buffer = self._buffer[noise:]
 
-    def rest(self, now: float = float("inf")) -> bytes:
-        """A piece of a frame whose rest did not come."""
-        if not self._heard or now - self._last < STALE:
+    def flush(self, now: float = float("inf")) -> bytes:
+        """Returns the part of a frame that was never completed; empty while the rest may still come."""
+        if not self._buffer or now - self._last < STALE_S:
             return b""
-        rest, self._heard = self._heard, b""
+        part, self._buffer = self._buffer, b""
         self.codec.reset()
-        return rest
+        return part
 
 
 class Tracer:
-    """Called with everything on the wire; `say` is told a line for each frame. `heard=False`: only what is sent."""
+    """Prints a line for each frame; `LocalRig` calls it with all bytes on the wire.
 
-    def __init__(self, codecs: Mapping[str, Codec], say: Callable[[str], None], *, heard: bool) -> None:
-        self._ears = {bus: Ear(codec) for bus, codec in codecs.items()}
-        self._say = say
-        self._heard = heard
-        self._began: float | None = None
-        self._now = 0.0
+    Args:
+        codecs: Bus -> a codec of its own.
+        write_line: Takes each line.
+        replies: False prints requests alone.
+    """
+
+    def __init__(self, codecs: Mapping[str, Codec], write_line: Callable[[str], None], *, replies: bool) -> None:
+        self._splitters = {bus: FrameSplitter(codec) for bus, codec in codecs.items()}
+        self._write_line = write_line
+        self._replies = replies
+        self._start: float | None = None
+        self._elapsed = 0.0
 
     def __call__(self, bus: str, sent: bool, data: bytes, now: float) -> None:
-        if self._began is None:
-            self._began = now
-        self._now = now - self._began
-        ear = self._ears[bus]
+        if self._start is None:
+            self._start = now
+        self._elapsed = now - self._start
+        splitter = self._splitters[bus]
         if sent:
-            self._tell(bus, ear.rest(now))
-            self._tell(bus, data, sent=True)
-        elif self._heard:
-            for frame in ear.hear(data, now):
-                self._tell(bus, frame)
+            self._print(bus, splitter.flush(now))
+            self._print(bus, data, sent=True)
+        elif self._replies:
+            for frame in splitter.receive(data, now):
+                self._print(bus, frame)
 
     def close(self) -> None:
-        """Tell what was never finished."""
-        for bus, ear in self._ears.items():
-            self._tell(bus, ear.rest())
+        """Print the parts of frames that were never completed."""
+        for bus, splitter in self._splitters.items():
+            self._print(bus, splitter.flush())
 
-    def _tell(self, bus: str, frame: bytes, *, sent: bool = False) -> None:
+    def _print(self, bus: str, frame: bytes, *, sent: bool = False) -> None:
         if frame:
-            words = self._ears[bus].codec.describe(frame, sent=sent)
-            self._say(f"{self._now:9.4f} {bus} {'>' if sent else '<'} {frame.hex(' ')}   {words}")
+            description = self._splitters[bus].codec.describe(frame, sent=sent)
+            self._write_line(f"{self._elapsed:9.4f} {bus} {'>' if sent else '<'} {frame.hex(' ')}   {description}")

@@ -8,38 +8,44 @@ from pathlib import Path
 
 import click
 
-from servobus.config.loader import load_config
+from servobus.cli.output import echo
 from servobus.daemon import units
 
 
 @click.command()
 @click.argument("config", metavar="CONFIG", default=units.CONFIG)
 @click.option("--write", "writing", is_flag=True, help="Write the files instead of printing them.")
-@click.option("--root", default="/", type=click.Path(path_type=Path, file_okay=False), help="Write them below this folder.")
-@click.option("--force", is_flag=True, help="Replace files that hold something else.")
+@click.option(
+    "--root", default="/", type=click.Path(path_type=Path, file_okay=False), help="Folder to write the files below. Default: /."
+)
+@click.option("--force", is_flag=True, help="Replace files that have other contents.")
 def install_service(config: str, writing: bool, root: Path, force: bool) -> None:
-    """Print the files that make `servobus run CONFIG` a service: systemd unit, udev rules, and its user.
+    """Print or write the files of a system service. They run `servobus run CONFIG`: a systemd unit, udev rules and a user.
 
-    CONFIG is where the service will find it, /etc/servobus/servobus.yaml if omitted; when it exists it is checked, and the unit
-    opens the network only if the config needs it. Nothing is started.
+    CONFIG is the path where the service finds its config, /etc/servobus/servobus.yaml if omitted. An existing CONFIG is checked,
+    and the unit opens the network only if that config needs it. Starts nothing.
 
     Example: servobus install-service /etc/servobus/servobus.yaml --write
     """
     path = Path(config).absolute()
-    network = False
-    if path.exists():
-        setup = load_config(path)
-        network = setup.door.tcp is not None or any("://" in bus.port for bus in setup.buses.values())
-    else:
-        click.echo(f"{path} is not there yet: the service needs it to start", err=True)
-    texts = units.files(_command(), str(path), network=network)
+    texts = units.files(_command(), str(path), network=_needs_network(path))
     if not writing:
-        for place, text in texts.items():
-            click.echo(f"# {place}\n{text}")
+        for file, text in texts.items():
+            echo(f"# {file}\n{text}")
         return
     for written in units.write(texts, root, force=force):
-        click.echo(f"wrote {written}")
-    click.echo("then, as root:\n  " + "\n  ".join(units.AFTER))
+        echo(f"wrote {written}")
+    echo("then, as root:\n  " + "\n  ".join(units.AFTER))
+
+
+def _needs_network(path: Path) -> bool:
+    if not path.exists():
+        echo(f"{path} does not exist yet: the service needs it to start", err=True)
+        return False
+    from servobus.config.loader import load_config
+
+    config = load_config(path)
+    return config.door.tcp is not None or any("://" in bus.port for bus in config.buses.values())
 
 
 def _command() -> str:

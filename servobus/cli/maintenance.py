@@ -1,4 +1,4 @@
-"""Commands that give servos their ids and rates, or tell them what is told once: set-id, set-baud, command."""
+"""Commands that change a servo for good: set-id, set-baud, command."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from collections.abc import Awaitable, Callable
 
 import click
 
-from servobus.cli.output import emit, logs, run
-from servobus.cli.rig_context import Options, opened, servo_options
-from servobus.config.loader import Config
-from servobus.errors import UnknownName
-from servobus.rig.interface import Rig
+import servobus
+from servobus.cli.options import Options, RigContext, on_rig, servo_options
+from servobus.cli.output import echo, emit
 from servobus.values import Change
 
-Id = click.IntRange(0, 255)
+ID = click.IntRange(0, 255)
+SAVE = "Save the change in the servo's flash; otherwise a restart of the servo forgets it."
 
 
 @click.command("set-id")
 @click.argument("bus")
-@click.argument("old", type=Id)
-@click.argument("new", type=Id)
-@click.option("--save", is_flag=True, help="Write it to the servo's flash; without, a restart forgets it.")
+@click.argument("old", type=ID)
+@click.argument("new", type=ID)
+@click.option("--save", is_flag=True, help=SAVE)
 @servo_options
 def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
-    """Give the servo with id OLD on a bus of the config the id NEW.
+    """Change the id of a servo. The servo with id OLD on BUS, a bus of the config, gets the id NEW.
 
-    Nothing on the bus is moved or enabled. Refused when two servos seem to answer at OLD, or one at NEW. Then change the config.
+    Refused while a servo of the bus is enabled, when two servos seem to answer at OLD, or when one answers at NEW. Moves nothing.
+    Write the new id into the config afterwards.
 
     Example: servobus set-id gimbal 37 38 --save
     """
@@ -34,12 +34,14 @@ def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
 
 @click.command("set-baud")
 @click.argument("bus")
-@click.argument("servo_id", metavar="ID", type=Id)
+@click.argument("servo_id", metavar="ID", type=ID)
 @click.argument("baudrate", type=click.IntRange(min=1))
-@click.option("--save", is_flag=True, help="Write it to the servo's flash; without, a restart forgets it.")
+@click.option("--save", is_flag=True, help=SAVE)
 @servo_options
 def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: bool) -> int:
-    """Give the servo with this id on a bus of the config another baud rate. Then change the config, when all servos have it.
+    """Change the baud rate of a servo. The servo with this ID on BUS, a bus of the config, gets BAUDRATE, in bits/s.
+
+    Refused while a servo of the bus is enabled. When all servos of the bus have the new rate, write it into the config.
 
     Example: servobus set-baud gimbal 37 115200 --save
     """
@@ -48,45 +50,36 @@ def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: boo
 
 @click.command()
 @click.argument("bus")
-@click.argument("servo_id", metavar="ID", type=Id)
+@click.argument("servo_id", metavar="ID", type=ID)
 @click.argument("name")
 @click.argument("value", required=False, type=int)
 @servo_options
 def command(options: Options, bus: str, servo_id: int, name: str, value: int | None) -> int:
-    """Tell the servo or hand with this id on a bus of the config what is told once: restart, save, zero_force, ...
+    """Send a maintenance command to a servo or a hand. The device with this ID on BUS, a bus of the config, gets it once.
 
-    Which commands there are depends on the protocol: a name that is none lists them. Never repeated, even if nobody answers.
-    Nothing on the bus may be enabled.
+    The protocol defines the commands (restart, save, zero_force, ...); an unknown NAME lists them. A command is never repeated,
+    even if no reply comes. Refused while a servo of the bus is enabled.
 
     Example: servobus command hand 2 zero_force
     """
-
-    async def verb(rig: Rig) -> tuple[str, ...]:
-        return await rig.command(bus, servo_id, name, value)
-
-    return _change(options, bus, verb)
+    return _change(options, bus, lambda rig: rig.command(bus, servo_id, name, value))
 
 
-def _change(options: Options, bus: str, verb: Callable[[Rig], Awaitable[Change | tuple[str, ...]]]) -> int:
-    logs()
+def _change(options: Options, bus: str, verb: Callable[[servobus.Rig], Awaitable[Change | tuple[str, ...]]]) -> int:
+    from servobus.cli.checks import check_bus
 
-    def refuse(config: Config) -> None:
-        if bus not in config.buses:
-            raise UnknownName(f"no bus {bus!r}: there are {', '.join(config.buses)}")
+    async def action(context: RigContext) -> int:
+        result = await verb(context.rig)
+        if options.as_json:
+            emit(result)
+        else:
+            echo("\n".join(_lines(result)))
+        return 0
 
-    async def main() -> int:
-        async with opened(options, only=[bus], before=refuse) as rig:
-            done = await verb(rig)
-            if options.as_json:
-                emit(done)
-            else:
-                click.echo("\n".join(_words(done)))
-            return 0
-
-    return run(main)
+    return on_rig(options, action, only=[bus], before=lambda config: check_bus(config, bus))
 
 
-def _words(done: Change | tuple[str, ...]) -> tuple[str, ...]:
-    if isinstance(done, Change):
-        return (str(done) if done.pending_reboot else f"{done.what} {done.value} is in effect", *done.notes)
-    return done or ("done",)
+def _lines(result: Change | tuple[str, ...]) -> tuple[str, ...]:
+    if isinstance(result, Change):
+        return (str(result) if result.pending_reboot else f"{result.what} {result.value} is in effect", *result.notes)
+    return result or ("done",)

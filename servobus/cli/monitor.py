@@ -1,131 +1,125 @@
-"""Commands that look on: monitor, stats."""
+"""Commands that show what happens: monitor, stats."""
 
 from __future__ import annotations
 
-import asyncio
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.live import Live
 
-from servobus.cli.output import (
-    STATE_COLUMNS,
-    Number,
-    echo_table,
-    emit,
-    logs,
-    run,
-    show,
-    state_row,
-    table,
-)
-from servobus.cli.rig_context import Options, opened, servo_options
-from servobus.remote.rig import RemoteRig
-from servobus.rig.interface import Rig
-from servobus.rig.local import LocalRig
-from servobus.values import Snapshot
+from servobus.cli.options import Number, Options, RigContext, on_rig, servo_options
+from servobus.cli.output import STATE_COLUMNS, echo, echo_table, emit, show, state_row
+from servobus.values import State
 
 MAX_HZ = 50.0
 
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MAX_HZ), help="Pictures per second.")
-@click.option("--count", type=click.IntRange(min=1), help="Stop after so many pictures.")
-@click.option("--seconds", type=Number(0.1), help="Stop after so long.")
+@click.option("--hz", default=10.0, show_default=True, type=Number(0.1, MAX_HZ), help="Updates per second.")
+@click.option("--count", type=click.IntRange(min=1), help="Stop after this number of updates.")
+@click.option("--seconds", type=Number(0.1), metavar="SECONDS", help="Stop after this time.")
 @servo_options
 def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None, seconds: float | None) -> int:
-    """Show what the servos do, live, until Ctrl-C. Servos that the config does not poll are read at --hz.
+    """Show the state of servos, live. Ends with Ctrl-C. Without a NAME all servos are shown.
 
-    Positions in the servo's unit, speed in unit/s. On a terminal a table; otherwise one line for each servo and picture; with
-    --json one JSON document a line, for each picture.
+    Positions are in the servo's unit, speed in unit/s, load in percent. A servo that the config does not poll is read at --hz. On
+    a terminal the output is a table; otherwise each update is one line a servo, with --json one JSON document.
 
     Example: servobus monitor --hz 5
     """
-    logs()
 
-    async def main() -> int:
-        async with opened(options, names) as rig:
-            shown, most = rig.full_names(names), _most(hz, count, seconds)
-            if options.as_json:
-                await _pictures(rig, shown, hz, most, emit)
-            elif not sys.stdout.isatty():
-                await _pictures(rig, shown, hz, most, _lines)
-            else:
-                with Live(console=Console(), auto_refresh=False, screen=False) as live:
-                    await _pictures(rig, shown, hz, most, lambda snapshot: live.update(_picture(snapshot), refresh=True))
-            return 0
+    async def action(context: RigContext) -> int:
+        if options.as_json:
+            await _show(context, names, hz, _updates(hz, count, seconds), emit)
+        elif not sys.stdout.isatty():
+            await _show(context, names, hz, _updates(hz, count, seconds), _print_lines)
+        else:
+            await _show_live(context, names, hz, _updates(hz, count, seconds))
+        return 0
 
-    return run(main)
+    return on_rig(options, action, names)
 
 
-def _most(hz: float, count: int | None, seconds: float | None) -> int | None:
-    """How many pictures; None: no end."""
+def _updates(hz: float, count: int | None, seconds: float | None) -> int | None:
+    """The number of updates; None: without end."""
     limits = [limit for limit in (count, seconds and math.ceil(seconds * hz)) if limit]
     return min(limits, default=None)
 
 
-def _lines(snapshot: Snapshot) -> None:
-    """What is known, in one line for each servo."""
+def _print_lines(snapshot: Mapping[str, State]) -> None:
     for name, state in snapshot.items():
         cells = zip(STATE_COLUMNS[1:], state_row(name, state)[1:], strict=True)
-        click.echo(f"{name}  " + "  ".join(f"{column}={show(cell)}" for column, cell in cells))
+        echo(f"{name}  " + "  ".join(f"{column}={show(cell)}" for column, cell in cells))
 
 
-def _picture(snapshot: Snapshot) -> Any:
-    return table(None, STATE_COLUMNS, [state_row(name, state) for name, state in snapshot.items()], narrow=True)
+async def _show_live(context: RigContext, names: tuple[str, ...], hz: float, count: int | None) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    from servobus.cli.tables import table
+
+    def update(snapshot: Mapping[str, State]) -> None:
+        rows = [state_row(name, state) for name, state in snapshot.items()]
+        live.update(table(None, STATE_COLUMNS, rows, narrow=True), refresh=True)
+
+    with Live(console=Console(), auto_refresh=False, screen=False) as live:
+        await _show(context, names, hz, count, update)
 
 
-async def _unpolled(rig: Rig, names: list[str]) -> list[str]:
-    """Those whose state nobody else keeps fresh."""
-    if isinstance(rig, RemoteRig):
-        polled = {bus: any((data["poll"] or {}).values()) for bus, data in (await rig.call("config"))["buses"].items()}
-    elif isinstance(rig, LocalRig):
-        polled = {bus: bool(options.poll.rates()) for bus, options in rig.config.buses.items()}
-    return [name for name in names if not polled[rig.names[name][0]]]
+async def _show(
+    context: RigContext, names: tuple[str, ...], hz: float, count: int | None, show_snapshot: Callable[[dict[str, State]], None]
+) -> None:
+    from asyncio import gather
 
-
-async def _pictures(rig: Rig, names: list[str], hz: float, count: int | None, tell: Callable[[Snapshot], None]) -> None:
-    unpolled = await _unpolled(rig, names)
-    taken = 0
+    rig, buses = context.rig, await context.buses()
+    shown = rig.full_names(names)
+    unpolled = [name for name in shown if not buses[rig.names[name][0]].polled]
+    done = 0
     async for _ in rig.watch(hz):
-        await asyncio.gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
+        await gather(*(rig.read(name, max_age=0.5 / hz) for name in unpolled), return_exceptions=True)
         snapshot = rig.snapshot()
-        tell({name: snapshot[name] for name in names})
-        taken += 1
-        if taken == count:
+        show_snapshot({name: snapshot[name] for name in shown})
+        done += 1
+        if done == count:
             return
 
 
 @click.command()
-@click.option("--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="How long to count without a daemon.")
+@click.option(
+    "--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="Time to poll and count without a daemon."
+)
 @servo_options
 def stats(options: Options, seconds: float) -> int:
-    """Tell what the lines carried and how long turns took: of a daemon since its start; without one, after polling for a while.
+    """Print the counters and times of each line. A daemon counts since its start; without one the command polls for a while.
+
+    Turn times and deadlines are in ms, loads in percent of the line's time.
 
     Example: servobus stats --seconds 10
     """
-    logs()
 
-    async def main() -> int:
-        async with opened(options) as rig:
-            if isinstance(rig, LocalRig):
-                await asyncio.sleep(seconds)
-            found = rig.stats()
-            if options.as_json:
-                emit(found)
-                return 0
-            for bus, counts in found.items():
-                rows = [(name, value) for name, value in counts.items() if not isinstance(value, dict)]
-                turn = counts["turn_ms"]
-                rows.append(("turn ms p50 / p99 / max", f"{turn['p50']} / {turn['p99']} / {turn['max']}"))
-                echo_table(bus, ("counter", "value"), rows)
-                nodes = [(node, *entry.values()) for node, entry in counts["nodes"].items()]
-                echo_table(None, ("id", "health", "misses", "deadline ms"), nodes)
-            return 0
+    async def action(context: RigContext) -> int:
+        from asyncio import sleep
 
-    return run(main)
+        if not context.has_daemon:
+            await sleep(seconds)
+        result = context.rig.stats()
+        if options.as_json:
+            emit(result)
+        else:
+            for bus, counts in result.items():
+                _print_stats(bus, counts)
+        return 0
+
+    return on_rig(options, action)
+
+
+def _print_stats(bus: str, counts: Mapping[str, Any]) -> None:
+    turn = counts["turn_ms"]
+    rows = [(name, value) for name, value in counts.items() if not isinstance(value, dict)]
+    rows.append(("turn ms p50 / p99 / max", f"{turn['p50']} / {turn['p99']} / {turn['max']}"))
+    echo_table(bus, ("counter", "value"), rows)
+    nodes = [(node, *values.values()) for node, values in counts["nodes"].items()]
+    echo_table(None, ("id", "health", "misses", "deadline ms"), nodes)

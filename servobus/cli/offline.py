@@ -6,77 +6,53 @@ from typing import Any
 
 import click
 
-from servobus.bus.bandwidth import Bandwidth, line_bandwidth
-from servobus.cli.output import echo_table, emit
-from servobus.config.loader import Config, config_schema, load_config
+from servobus.cli.output import echo, emit, report
 from servobus.errors import ConfigError, UnknownName
-from servobus.links import open_link
-from servobus.links.ports import list_ports
-from servobus.protocols.base import Codec, LineTraits
-from servobus.protocols.options import BusOptions
-from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.link import SIMULATED
+
+LOAD_COLUMNS = ("bus", "goals %", "feedback %", "health %", "load %", "goal ms", "e-stop ms", "silent ms")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
 
 
 @click.command()
 @click.argument("config", metavar="CONFIG")
-@click.option("--json", "as_json", is_flag=True, help="For machines.")
+@json_option
 def check(config: str, as_json: bool) -> None:
-    """Validate a config and tell what its rates ask of each line.
+    """Validate a config and print the load of each line.
 
-    Shares are in percent of the line's time, for goals of all servos at `goal_rate` and for each poll. Latencies are the worst
-    while every servo answers; the last column is what one silent servo adds, once. More than 100 % is an error (status 2).
+    Loads are in percent of the line's time: goals for all servos at `goal_rate`, and each poll. "goal ms" and "e-stop ms" are the
+    longest waits while every servo answers; "silent ms" is what one silent servo adds, once. A load over 100 % is an error (exit
+    status 2).
 
     Example: servobus check config/arm.yaml
     """
-    loads = loads_of(load_config(config))
-    if as_json:
-        emit({name: _as_dict(load) for name, load in loads.items()})
-    else:
-        echo_table(
-            None, ("bus", "goals %", "feedback %", "health %", "load %", "goal ms", "e-stop ms", "silent ms"), _rows(loads)
-        )
-    heavy = [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]
-    if heavy:
+    from servobus.cli.checks import line_loads
+    from servobus.config.loader import load_config
+
+    loads = line_loads(load_config(config))
+    data = {name: _load_as_dict(load) for name, load in loads.items()}
+    report(as_json, data, LOAD_COLUMNS, [_load_row(name, load) for name, load in loads.items()])
+    overloaded = [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]
+    if overloaded:
         raise ConfigError(
-            f"{config}: more than the line carries: {', '.join(heavy)}; lower poll or goal_rate, or raise the baud rate"
+            f"{config}: more than the line carries: {', '.join(overloaded)}; lower poll or goal_rate, or raise the baud rate"
         )
     if not as_json:
-        click.echo(f"{config}: ok")
+        echo(f"{config}: ok")
 
 
-def loads_of(config: Config) -> dict[str, Bandwidth]:
-    """What each bus has to carry."""
-    found = {}
-    for name, options in config.buses.items():
-        driver = PROTOCOLS[options.protocol].driver(options, config.models[name])
-        found[name] = line_bandwidth(options, driver, _traits(options))
-    return found
+def _load_row(name: str, load: Any) -> tuple[object, ...]:
+    """A Bandwidth as a row of `LOAD_COLUMNS`."""
+    return (
+        name,
+        *(round(load.shares.get(kind, 0.0), 1) for kind in ("goals", "feedback", "health")),
+        round(load.total, 1),
+        round(1e3 * load.goal_latency, 2),
+        round(1e3 * load.estop_latency, 2),
+        round(1e3 * load.silent_latency, 1),
+    )
 
 
-def _traits(options: BusOptions) -> LineTraits:
-    if options.port.startswith(SIMULATED):
-        return LineTraits(options.baudrate)
-    return open_link(options.port, options.baudrate, rs485=options.rs485).traits
-
-
-def _rows(loads: dict[str, Bandwidth]) -> list[tuple[object, ...]]:
-    return [
-        (
-            name,
-            round(load.shares["goals"], 1),
-            round(load.shares.get("feedback", 0.0), 1),
-            round(load.shares.get("health", 0.0), 1),
-            round(load.total, 1),
-            round(1e3 * load.goal_latency, 2),
-            round(1e3 * load.estop_latency, 2),
-            round(1e3 * load.silent_latency, 1),
-        )
-        for name, load in loads.items()
-    ]
-
-
-def _as_dict(load: Bandwidth) -> dict[str, Any]:
+def _load_as_dict(load: Any) -> dict[str, Any]:
     return {
         "load_percent": {**{name: round(share, 2) for name, share in load.shares.items()}, "total": round(load.total, 2)},
         "goal_latency_ms": round(1e3 * load.goal_latency, 3),
@@ -91,36 +67,42 @@ def schema() -> None:
 
     Example: servobus schema > servobus.schema.json
     """
+    from servobus.config.schema import config_schema
+
     emit(config_schema())
 
 
 @click.command()
 @click.argument("hex_bytes", metavar="HEX...", nargs=-1, required=True)
-@click.option("--protocol", default="sms", show_default=True, help="Whose frames they are.")
-@click.option("--request", "only", flag_value="request", help="Only as what a master says.")
-@click.option("--reply", "only", flag_value="reply", help="Only as what a servo answers.")
-@click.option("--json", "as_json", is_flag=True, help="For machines.")
+@click.option("--protocol", default="sms", show_default=True, help="Protocol of the frames: sms, kst or roh.")
+@click.option("--request", "only", flag_value="request", help="Explain them as requests of a master alone.")
+@click.option("--reply", "only", flag_value="reply", help="Explain them as replies of a servo alone.")
+@json_option
 def decode(hex_bytes: tuple[str, ...], protocol: str, only: str | None, as_json: bool) -> None:
-    """Tell what a frame, or several in a row, say: as a request and as a reply, since many look like both.
+    """Explain the frames in some bytes. Prints them as requests and as replies, since many bytes can be either.
+
+    HEX is hexadecimal text, with or without spaces, commas or 0x.
 
     Example: servobus decode FF FF 01 02 01 FB
     """
+    from servobus.protocols.registry import PROTOCOLS
+
     if protocol not in PROTOCOLS:
         raise UnknownName(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
-    entry, data = PROTOCOLS[protocol], _bytes_of(" ".join(hex_bytes))
-    codecs = {"request": entry.device_codec(None), "reply": entry.codec(None)}
-    words = {kind: _in_words(codec, data, kind) for kind, codec in codecs.items() if only in (None, kind)}
+    definition, data = PROTOCOLS[protocol], _bytes_of(" ".join(hex_bytes))
+    codecs = {"request": definition.device_codec(None), "reply": definition.codec(None)}
+    texts = {kind: _describe(codec, data, kind) for kind, codec in codecs.items() if only in (None, kind)}
     if as_json:
-        emit({"frame": data.hex(" "), **words})
-    elif len(set(words.values())) == 1:
-        click.echo(next(iter(words.values())))
+        emit({"frame": data.hex(" "), **texts})
+    elif len(set(texts.values())) == 1:
+        echo(next(iter(texts.values())))
     else:
-        for kind, line in words.items():
-            click.echo(f"as a {kind}: {line}")
+        for kind, text in texts.items():
+            echo(f"as a {kind}: {text}")
 
 
-def _in_words(codec: Codec, data: bytes, kind: str) -> str:
-    """Of each frame; of the whole where it is not frames from end to end."""
+def _describe(codec: Any, data: bytes, kind: str) -> str:
+    """Describes each frame; where the data is not frames from end to end, describes it as a whole."""
     codec.receive_data(data)
     frames = []
     while (reply := codec.next_reply()) is not None:
@@ -137,27 +119,29 @@ def _bytes_of(text: str) -> bytes:
     except ValueError:
         data = b""
     if not data:
-        raise click.BadParameter(f"{text!r} is no hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX")
+        raise click.BadParameter(f"{text!r} is not hexadecimal text: write FF FF 01 02 01 FB or ffff010201fb", param_hint="HEX")
     return data
 
 
 @click.command()
-@click.option("--json", "as_json", is_flag=True, help="For machines.")
+@json_option
 def ports(as_json: bool) -> None:
-    """List the serial ports of this machine: the name to put into a config (it belongs to the adapter), the name of the socket
-    it is plugged into, what it is, and who holds it.
+    """List the serial ports of this machine.
+
+    "port" is the name for a config: it belongs to the adapter. "by socket" belongs to the socket that the adapter is plugged
+    into; use it for adapters without a serial number. "held by" is the program that has the port open, with its process id.
 
     Example: servobus ports
     """
-    found = list_ports()
-    if as_json:
-        emit(found)
-    elif not found:
-        click.echo("no serial ports; is the adapter plugged in?")
-    else:
-        rows = [(port.by_id or port.device, port.device, port.by_path, port.description, _held_by(port.holder)) for port in found]
-        echo_table(None, ("port", "device", "by socket", "description", "held by"), rows)
+    from servobus.links.ports import list_ports
+
+    listed = list_ports()
+    if not listed and not as_json:
+        echo("no serial ports; is the adapter plugged in?")
+        return
+    rows = [(port.by_id or port.device, port.device, port.by_path, port.description, _holder(port.holder)) for port in listed]
+    report(as_json, listed, ("port", "device", "by socket", "description", "held by"), rows)
 
 
-def _held_by(holder: tuple[int, str] | None) -> str | None:
+def _holder(holder: tuple[int, str] | None) -> str | None:
     return f"{holder[1]} ({holder[0]})" if holder else None

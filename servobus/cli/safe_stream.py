@@ -1,4 +1,4 @@
-"""Where a bus at work tells things. A reader who has gone (`| head`, a closed terminal) must not stop a bus in mid-turn."""
+"""The stream of logs and traces. A reader who is gone (`| head`, a closed terminal) must not stop a bus in mid-turn."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TextIO
 
 
 class SafeStream:
-    """A stream as logs and traces need it; what it says is lost in silence once nobody can hear it."""
+    """Writes to a stream, and discards everything once nobody reads it."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
-    def say(self, line: str) -> None:
+    def write_line(self, line: str) -> None:
         self.write(f"{line}\n")
         self.flush()
 
@@ -21,17 +21,17 @@ class SafeStream:
         try:
             self._stream.write(text)
         except OSError:
-            self._hush()
+            self._discard()
 
     def flush(self) -> None:
         try:
             self._stream.flush()
         except OSError:
-            self._hush()
+            self._discard()
 
-    def _hush(self) -> None:
-        """Everything further goes nowhere, also what the interpreter flushes at its end."""
+    def _discard(self) -> None:
+        """Sends everything further to /dev/null, also what the interpreter flushes when it ends."""
         with suppress(OSError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)

@@ -1,4 +1,4 @@
-"""Commands that stay: run, sim."""
+"""Commands that run for a while: run, sim, demo."""
 
 from __future__ import annotations
 
@@ -7,63 +7,85 @@ import signal
 import stat
 from pathlib import Path
 
-import anyio
 import click
 
-from servobus.cli.output import Number, logs
-from servobus.cli.output import run as run_loop
-from servobus.config.loader import load_config
-from servobus.daemon.main import serve_rig
+from servobus.cli.options import Number
+from servobus.cli.output import echo
 from servobus.errors import ConfigError
-from servobus.rig.logs import EventLogger
-from servobus.rpc.socket_path import socket_path
-from servobus.simulation.serve import serve
-
-log = EventLogger("servobus.cli")
 
 
 @click.command()
 @click.argument("config", metavar="CONFIG")
-@click.option("--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between two lines of state.")
+@click.option("--log-every", default=10.0, show_default=True, type=Number(min=0.1), help="Seconds between logs of each bus.")
 def run(config: str, log_every: float) -> None:
-    """Own the ports of CONFIG until SIGTERM or Ctrl-C, and let other programs in.
+    """Own the ports of CONFIG as a daemon, and serve other programs. Ends on SIGTERM or Ctrl-C.
 
-    Polls at the config's rates, waits for ports that are missing, logs what happens on standard error (JSON when that is no
-    terminal). Writes nothing at start. Commands and `servobus.connect()` find it by its socket: SERVOBUS_SOCKET, else in
-    $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/servobus or /run/servobus. SIGHUP reads CONFIG anew. At the end each servo that was
-    enabled is left as its `on_exit` says.
+    Polls at the rates of the config, waits for ports that are missing, and logs on standard error (as JSON where that is not a
+    terminal). Writes nothing to a servo at start. Commands and `servobus.connect()` find the daemon by its socket: at
+    SERVOBUS_SOCKET, else in $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/servobus or /run/servobus. SIGHUP reads CONFIG again. At the end
+    each servo that was enabled is left as its `on_exit` says.
 
     Example: servobus run config/arm.yaml
     """
-    logs(logging.INFO)
-    load_config(config)  # what is wrong with it is told before anything is claimed
+    from servobus.cli.event_loop import run as run_loop
+    from servobus.cli.logs import set_up_logs
+    from servobus.config.loader import load_config
+    from servobus.daemon.main import serve_rig
+    from servobus.rig.logs import EventLogger
+    from servobus.rpc.socket_path import socket_path
+
+    set_up_logs(logging.INFO)
+    load_config(config)  # a wrong config is refused before the socket is claimed
     if Path(config).stat().st_mode & stat.S_IWOTH:
-        raise ConfigError(f"{config}: everybody may write to it, and so say what this daemon does: chmod o-w {config}")
+        raise ConfigError(f"{config}: every user may write to it, and so decide what this daemon does: run chmod o-w {config}")
     try:
-        run_loop(lambda: serve_rig(config, socket_path(), log_every), terminated=0, endings=[signal.SIGTERM])
+        run_loop(lambda: serve_rig(config, socket_path(), log_every), terminated=0, signals=[signal.SIGTERM])
     finally:
-        log.info("ended")
+        EventLogger("servobus.cli").info("ended")
 
 
 @click.command()
 @click.argument("config", metavar="CONFIG")
-@click.option("--folder", type=click.Path(file_okay=False, path_type=Path), help="Also make a link named like each bus here.")
+@click.option("--folder", type=click.Path(file_okay=False, path_type=Path), help="Also make a link to each port here.")
 def sim(config: str, folder: Path | None) -> None:
-    """Serve the servos of CONFIG, simulated, as serial ports that any program can open.
+    """Serve the servos of CONFIG, simulated, as serial ports. Any program can open them. Ends on SIGTERM or Ctrl-C.
 
-    Prints one line `BUS PATH` for each bus on standard output and nothing else there, then serves until it is interrupted. The
-    config's `port` plays no part, but that realman://... becomes a simulated arm on a TCP port (`BUS realman://127.0.0.1:...`).
-    A servo hears only its own baud rate.
+    Prints one line `BUS PATH` for each bus on standard output, and nothing else there. The config's `port` is ignored, but for
+    realman://...: it becomes a simulated arm on a TCP port (`BUS realman://127.0.0.1:...`). A servo receives only what is sent at
+    its own baud rate.
 
     Example: servobus sim config/sim.yaml
     """
-    logs()
-    setup = load_config(config)
+    from servobus.cli.event_loop import run as run_loop
+    from servobus.cli.logs import set_up_logs
+    from servobus.config.loader import load_config
+    from servobus.simulation.serve import serve
+
+    set_up_logs()
+    parsed = load_config(config)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
 
-    async def main() -> None:
-        with anyio.CancelScope():
-            await serve(setup.buses, setup.models, lambda name, path: click.echo(f"{name} {path}"), folder=folder)
+    def announce(bus: str, path: str) -> None:
+        echo(f"{bus} {path}")
 
-    run_loop(main, terminated=0)
+    run_loop(lambda: serve(parsed.buses, parsed.models, announce, folder=folder), terminated=0)
+
+
+@click.command()
+@click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="Time to stream goals.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
+def demo(seconds: float, as_json: bool) -> int:
+    """Stream goals to 20 simulated servos on four lines. Prints what the lines carried, with real wire time.
+
+    Six STS at 1 Mbaud, four SMS at 115200 baud, four KST at 512000 baud and the six fingers of a ROH hand at 115200 baud. One
+    caller for each servo sends 100 goals a second; feedback is polled at 50 Hz.
+
+    Example: servobus demo --seconds 3
+    """
+    from servobus.cli.demo import stream
+    from servobus.cli.event_loop import run as run_loop
+    from servobus.cli.logs import set_up_logs
+
+    set_up_logs(logging.ERROR)
+    return run_loop(lambda: stream(seconds, as_json=as_json))

@@ -10,9 +10,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 
 from servobus.config.access import AccessOptions, DoorOptions
 from servobus.documents import reader
@@ -63,33 +63,6 @@ def load_config(path: str | Path) -> Config:
 def parse_config(text: str | bytes, name: str, folder: Path = Path()) -> Config:
     """The config in a text; `name` stands in messages. Raises ConfigError."""
     return _config(reader.parse(text, name), folder)
-
-
-def config_schema() -> dict[str, Any]:
-    """JSON Schema, for editors."""
-    options = tuple(entry.options for entry in PROTOCOLS.values())
-    bus: Any = Annotated[Union[options], Field(discriminator="protocol")] if len(options) > 1 else options[0]  # noqa: UP007
-    definitions: dict[str, Any] = {}
-
-    def schema(kind: Any) -> dict[str, Any]:
-        made = TypeAdapter(kind).json_schema(ref_template="#/$defs/{model}")
-        definitions.update(made.pop("$defs", {}))
-        return made
-
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "servobus config",
-        "type": "object",
-        "properties": {
-            "version": {"const": VERSION, "description": "Of this format."},
-            "buses": {**schema(dict[Name, bus]), "minProperties": 1, "description": "Lines by name; each has one owner."},
-            "access": schema(AccessOptions),
-            "door": schema(DoorOptions),
-        },
-        "required": list(REQUIRED),
-        "additionalProperties": False,
-        "$defs": definitions,
-    }
 
 
 def _config(document: reader.Document, folder: Path) -> Config:

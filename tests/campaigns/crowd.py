@@ -14,7 +14,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from servobus.cli.output import loop_factory
+from servobus.cli.event_loop import loop_factory
 from tests.campaigns.daemon import answer, daemon
 
 CLIENTS, RATE, HZ, MOVERS = 1000, 3.0, 5.0, 6

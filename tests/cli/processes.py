@@ -48,11 +48,11 @@ class Terminal:
     def rest(self) -> str:
         """Everything written until all writers are gone."""
         self.end.close()
-        told = ""
+        output = ""
         with suppress(OSError):  # how Linux says that no writer is left
             while piece := self.some():
-                told += piece
-        return told
+                output += piece
+        return output
 
     def close(self) -> None:
         self.end.close()
@@ -63,7 +63,7 @@ def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
     """The first log line of that name."""
     assert process.stderr is not None
     for line in process.stderr:
-        entry: dict[str, object] = json.loads(line)
-        if entry["event"] == event:
-            return entry
+        record: dict[str, object] = json.loads(line)
+        if record["event"] == event:
+            return record
     raise AssertionError(f"{event} was never logged")

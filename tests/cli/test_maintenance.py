@@ -1,4 +1,4 @@
-"""set-id and set-baud: one servo at a time, told what is still to be done, and refused in words."""
+"""set-id and set-baud: one servo at a time, with the next step, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_a_new_id_waits_for_a_restart(capsys: pytest.CaptureFixture[str]) -> Non
     assert status_of(["set-id", "gimbal", "37", "40", "--save"]) == 0
     assert capsys.readouterr().out == "pending_reboot: id 40 is set and not in effect yet: restart the servo\n"
     assert status_of(["set-id", "gimbal", "37", "40", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["value"], found["saved"], found["pending_reboot"]) == (40, False, True)
+    change = json.loads(capsys.readouterr().out)
+    assert (change["value"], change["saved"], change["pending_reboot"]) == (40, False, True)
 
 
 @pytest.mark.usefixtures("rig")
@@ -47,7 +47,7 @@ def test_a_new_baud_rate(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status", "told"),
+    ("arguments", "status", "message"),
     [
         (["set-id", "gimbal", "37", "38"], 2, "id 38 belongs to another servo"),
         (["set-id", "gimbal", "37", "255"], 2, "id 255 is outside 1 to 254"),
@@ -60,6 +60,6 @@ def test_a_new_baud_rate(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 @pytest.mark.usefixtures("rig")
-def test_what_is_refused(arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_refused(arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(arguments) == status
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err

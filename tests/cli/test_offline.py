@@ -20,16 +20,16 @@ def good(tmp_path: Path) -> Path:
     return path
 
 
-def test_check_tells_the_load(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_the_load(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(["check", str(good)]) == 0
     out = capsys.readouterr().out
     assert "load %" in out
     assert "rig.yaml: ok" in out
     assert status_of(["check", str(good), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert set(found["arm"]) == {"load_percent", "goal_latency_ms", "estop_latency_ms", "silent_servo_ms"}
-    assert found["arm"]["load_percent"]["total"] == pytest.approx(
-        sum(v for k, v in found["arm"]["load_percent"].items() if k != "total"), abs=0.1
+    loads = json.loads(capsys.readouterr().out)
+    assert set(loads["arm"]) == {"load_percent", "goal_latency_ms", "estop_latency_ms", "silent_servo_ms"}
+    assert loads["arm"]["load_percent"]["total"] == pytest.approx(
+        sum(v for k, v in loads["arm"]["load_percent"].items() if k != "total"), abs=0.1
     )
 
 
@@ -38,10 +38,10 @@ def test_check_names_file_line_and_column(mistake: Mistake, tmp_path: Path, caps
     path = tmp_path / "rig.yaml"
     path.write_text(mistake.text)
     assert status_of(["check", str(path)]) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith(f"servobus: {path}:{mistake.line}:{mistake.column}: ")
-    assert mistake.told in told.err
-    assert told.out == ""
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"servobus: {path}:{mistake.line}:{mistake.column}: ")
+    assert mistake.message in captured.err
+    assert captured.out == ""
 
 
 def test_more_than_the_line_carries_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -89,13 +89,13 @@ def test_decode_for_machines(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out)["request"] == "all ACTION"
 
 
-def test_decode_of_what_is_no_frame(capsys: pytest.CaptureFixture[str]) -> None:
+def test_decode_of_other_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(["decode", "01 02"]) == 0
     assert "no SMS packet" in capsys.readouterr().out
     assert status_of(["decode", "xyz"]) == 2
-    assert "no hexadecimal text" in capsys.readouterr().err
+    assert "not hexadecimal text" in capsys.readouterr().err
     assert status_of(["decode", ","]) == 2
-    assert "no hexadecimal text" in capsys.readouterr().err
+    assert "not hexadecimal text" in capsys.readouterr().err
     assert status_of(["decode", "FF", "--protocol", "abc"]) == 2
     assert "there are sms" in capsys.readouterr().err
 

@@ -7,8 +7,10 @@ from typing import cast
 
 import pytest
 
-from servobus.cli.output import show, table
-from servobus.cli.rig_context import Options, opened
+from servobus.cli.options import Options
+from servobus.cli.output import show
+from servobus.cli.rig_context import open_context
+from servobus.cli.tables import table
 from servobus.errors import DeviceError
 from servobus.rig.interface import Rig
 from servobus.rig.local import LocalRig
@@ -28,26 +30,26 @@ def silence(rig: Rig) -> None:
     cast("SimulatedLink", cast("LocalRig", rig).supervisors["arm"].link).line.close()
 
 
-async def test_how_servos_were_left_is_told_when_nobody_confirms_it(options: Options) -> None:
+async def test_an_unconfirmed_exit_policy_is_an_error(options: Options) -> None:
     with pytest.raises(DeviceError, match=r"how it was left: arm/shoulder \(hold: .+\); look") as caught:  # noqa: PT012 - at the end
-        async with opened(options, ["shoulder"]) as rig:
-            await rig.enable("shoulder")
-            silence(rig)
+        async with open_context(options, ["shoulder"]) as context:
+            await context.rig.enable("shoulder")
+            silence(context.rig)
     assert caught.value.exit_status == 1
 
 
-async def test_what_went_wrong_before_is_told_first(options: Options) -> None:
+async def test_an_earlier_error_is_raised_first(options: Options) -> None:
     with pytest.raises(ValueError, match="first"):  # noqa: PT012 - it is raised by the last statement
-        async with opened(options, ["shoulder"]) as rig:
-            await rig.enable("shoulder")
-            silence(rig)
+        async with open_context(options, ["shoulder"]) as context:
+            await context.rig.enable("shoulder")
+            silence(context.rig)
             raise ValueError("first")
 
 
-async def test_servos_that_confirm_how_they_are_left(options: Options) -> None:
-    async with opened(options) as rig:
-        await rig.enable()
-    assert {name: (report.action, report.confirmed) for name, report in cast("LocalRig", rig).left.items()} == {
+async def test_confirmed_exit_policies_are_no_error(options: Options) -> None:
+    async with open_context(options) as context:
+        await context.rig.enable()
+    assert {name: (report.action, report.confirmed) for name, report in cast("LocalRig", context.rig).left.items()} == {
         "arm/shoulder": ("hold", True),
         "arm/elbow": ("hold", True),
     }
@@ -70,6 +72,6 @@ def test_cells(value: object, shown: str) -> None:
     assert show(value) == shown
 
 
-def test_numbers_stand_right_and_words_left() -> None:
+def test_numbers_are_on_the_right_and_text_on_the_left() -> None:
     made = table(None, ("name", "value", "mixed"), [("a", 1.5, 1), ("b", None, "x")])
     assert [column.justify for column in made.columns] == ["left", "right", "left"]

@@ -36,21 +36,21 @@ def test_run_waits_for_a_port(tmp_path: Path) -> None:
         assert process.wait(10) == 0
 
 
-def test_a_config_that_everybody_may_write_is_not_run(rig: str) -> None:
+def test_a_world_writable_config_is_not_run(rig: str) -> None:
     os.chmod(rig, 0o666)
     with servobus("run", rig) as process:
-        _, told = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=20)
         assert process.returncode == 2
-        assert "everybody may write to it" in told
+        assert "every user may write to it" in errors
 
 
 def test_a_second_daemon_is_refused_with_the_pid_of_the_first(rig: str) -> None:
     with servobus("run", rig) as first:
         until(first, "running")
         with servobus("run", rig) as second:
-            _, told = second.communicate(timeout=20)
+            _, errors = second.communicate(timeout=20)
             assert second.returncode == 1
-            assert f"daemon (pid {first.pid}) listens at" in told
+            assert f"daemon (pid {first.pid}) listens at" in errors
         first.terminate()
         assert first.wait(10) == 0
 
@@ -102,14 +102,14 @@ def test_a_simulator_and_a_daemon_on_its_port(rig: str, tmp_path: Path) -> None:
         with servobus("run", str(real)) as daemon:
             until(daemon, "running")
             with servobus("read", "-c", str(real)) as client:
-                told, _ = client.communicate(timeout=20)
+                output, _ = client.communicate(timeout=20)
                 assert client.returncode == 0
-                assert "shoulder" in told, "the daemon was asked"
+                assert "shoulder" in output, "the daemon answered"
             with servobus("read", "-c", str(real), "--direct") as second:
-                _, told = second.communicate(timeout=20)
+                _, errors = second.communicate(timeout=20)
                 assert second.returncode == 1
-                assert f"process {daemon.pid}" in told
-                assert f"the servobus daemon (pid {daemon.pid}) owns it: leave --direct out" in told
+                assert f"process {daemon.pid}" in errors
+                assert f"the servobus daemon (pid {daemon.pid}) owns it: leave --direct out" in errors
             sim.kill()
             assert until(daemon, "line_down")["bus"] == "arm"
             daemon.terminate()
@@ -128,7 +128,7 @@ def test_sim_prints_its_ports_and_nothing_else(rig: str, number: signal.Signals,
         assert (out, err.strip(), process.returncode) == ("", "", status)
 
 
-def test_an_interrupted_scan_tells_what_it_found(rig: str) -> None:
+def test_an_interrupted_scan_prints_its_hits(rig: str) -> None:
     with servobus("scan", "-c", rig, "--baudrate", "9600,1000000", "--json", "--trace") as process:
         assert process.stderr is not None
         for line in process.stderr:
@@ -140,7 +140,7 @@ def test_an_interrupted_scan_tells_what_it_found(rig: str) -> None:
         assert isinstance(json.loads(out), list)
 
 
-def test_who_reads_no_further_is_told_nothing() -> None:
+def test_a_closed_pipe_ends_a_command_silently() -> None:
     with servobus("schema") as process:
         assert process.stdout is not None
         process.stdout.close()
@@ -150,7 +150,7 @@ def test_who_reads_no_further_is_told_nothing() -> None:
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGHUP, 143), (signal.SIGINT, 130)])
-def test_an_interrupted_move_leaves_the_servo_as_its_on_exit_says(rig: str, number: signal.Signals, status: int) -> None:
+def test_an_interrupted_move_applies_on_exit(rig: str, number: signal.Signals, status: int) -> None:
     with servobus("move", "-c", rig, "shoulder=80", "--speed", "1", "--timeout", "100", "--trace") as process:
         assert process.stderr is not None
         torque_on = "WRITE 0x28 = 01"
@@ -162,7 +162,7 @@ def test_an_interrupted_move_leaves_the_servo_as_its_on_exit_says(rig: str, numb
         assert out == ""
 
 
-def test_a_trace_that_nobody_reads_does_not_stop_a_motion(rig: str) -> None:
+def test_a_closed_trace_does_not_stop_a_motion(rig: str) -> None:
     with servobus("move", "-c", rig, "shoulder=5", "--speed", "300", "--trace") as process:
         assert process.stderr is not None
         process.stderr.readline()
@@ -172,7 +172,7 @@ def test_a_trace_that_nobody_reads_does_not_stop_a_motion(rig: str) -> None:
         assert process.wait(10) == 0
 
 
-def test_logs_that_nobody_reads_do_not_stop_a_daemon(rig: str) -> None:
+def test_closed_logs_do_not_stop_a_daemon(rig: str) -> None:
     with servobus("run", rig, "--log-every", "0.1") as process:
         until(process, "state")
         assert process.stderr is not None
@@ -181,7 +181,7 @@ def test_logs_that_nobody_reads_do_not_stop_a_daemon(rig: str) -> None:
         assert process.wait(10) == 0
 
 
-def test_a_picture_that_nobody_reads_ends_the_monitor(rig: str) -> None:
+def test_a_closed_pipe_ends_the_monitor(rig: str) -> None:
     with servobus("monitor", "-c", rig, "--hz", "50") as process:
         assert process.stdout is not None
         process.stdout.readline()
@@ -191,7 +191,7 @@ def test_a_picture_that_nobody_reads_ends_the_monitor(rig: str) -> None:
         assert process.stderr.read() == ""
 
 
-def test_a_line_that_is_lost_during_a_scan_does_not_lose_what_was_found(rig: str, tmp_path: Path) -> None:
+def test_a_scan_whose_line_is_lost_prints_its_hits(rig: str, tmp_path: Path) -> None:
     with servobus("sim", rig) as sim:
         assert sim.stdout is not None
         path = sim.stdout.readline().split()[1]

@@ -11,7 +11,7 @@ from tests.cli.processes import Terminal, servobus
 pytestmark = pytest.mark.slow
 
 
-def test_the_monitor_on_a_terminal_is_a_table_without_folds(rig: str, terminal: Terminal) -> None:
+def test_the_monitor_on_a_terminal_is_an_unfolded_table(rig: str, terminal: Terminal) -> None:
     arguments = ("monitor", "-c", rig, "--count", "2", "--hz", "50")
     with servobus(*arguments, stdout=terminal.end, NO_COLOR="1", TERM="xterm") as process:
         picture = terminal.rest()
@@ -21,7 +21,7 @@ def test_the_monitor_on_a_terminal_is_a_table_without_folds(rig: str, terminal: 
         assert "health" in picture
 
 
-def test_a_scan_on_a_terminal_shows_how_far_it_is_and_how_long_it_will_take(rig: str, terminal: Terminal) -> None:
+def test_a_scan_on_a_terminal_shows_its_progress(rig: str, terminal: Terminal) -> None:
     with servobus("scan", "-c", rig, "--ids", "1-40", "--json", stderr=terminal.end, TERM="xterm") as process:
         bar = terminal.rest()
         assert process.stdout is not None
@@ -35,11 +35,11 @@ def test_a_scan_on_a_terminal_shows_how_far_it_is_and_how_long_it_will_take(rig:
 @pytest.mark.parametrize(("no_color", "coloured"), [("", True), ("1", False)])
 def test_logs_on_a_terminal_are_for_people(rig: str, no_color: str, coloured: bool, terminal: Terminal) -> None:
     with servobus("run", rig, "--log-every", "0.1", stderr=terminal.end, NO_COLOR=no_color) as process:
-        told = ""
-        while "state" not in told:
-            told += terminal.some()
+        output = ""
+        while "state" not in output:
+            output += terminal.some()
         process.terminate()
-        told += terminal.rest()
+        output += terminal.rest()
         assert process.wait(10) == 0
-        assert "running" in told
-        assert ("\x1b[" in told) is coloured
+        assert "running" in output
+        assert ("\x1b[" in output) is coloured

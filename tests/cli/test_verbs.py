@@ -25,7 +25,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class Call:
-    """Runs a command and keeps what it said."""
+    """Runs a command and keeps its output."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
@@ -79,14 +79,14 @@ def test_all_registers_are_checked_before_the_first_is_written(call: Call) -> No
 
 
 def test_move(call: Call) -> None:
-    found = call.json("move", "shoulder=-20", "leg/elbow=5.5", "--speed", "300")
-    assert found["arm/shoulder"]["position"] == pytest.approx(-20, abs=0.9)
-    assert found["leg/elbow"]["position"] == pytest.approx(5.5, abs=0.9)
+    positions = call.json("move", "shoulder=-20", "leg/elbow=5.5", "--speed", "300")
+    assert positions["arm/shoulder"]["position"] == pytest.approx(-20, abs=0.9)
+    assert positions["leg/elbow"]["position"] == pytest.approx(5.5, abs=0.9)
     assert call("move", "shoulder=1", "--together", "--confirm") == 0
     assert "holds (on_exit)" in call.out
 
 
-def test_what_a_limit_forbids_energises_nothing(call: Call) -> None:
+def test_a_goal_beyond_a_limit_energises_nothing(call: Call) -> None:
     assert call("move", "elbow=5", "shoulder=90.1", "--trace") == 2
     assert call("move", "arm/elbow=5", "shoulder=90.1", "--trace") == 2
     assert "arm/shoulder: position 90.1 is outside -90 to 90: nothing was sent" in call.err
@@ -120,20 +120,20 @@ def test_monitor_and_stats(call: Call) -> None:
         ["arm/shoulder", "position=0.00"],
         ["leg/hip", "position=0.00"],
     ]
-    found = call.json("stats", "--seconds", "0.2")
-    assert found["arm"]["up"] is True
-    assert found["leg"]["nodes"]["1"]["health"] == "online"
+    stats = call.json("stats", "--seconds", "0.2")
+    assert stats["arm"]["up"] is True
+    assert stats["leg"]["nodes"]["1"]["health"] == "online"
     assert call("stats", "--seconds", "0.1") == 0
     assert "wire_load_percent" in call.out
 
 
 def test_scan(call: Call, tmp_path: Path) -> None:
-    found = call.json("scan", "arm", "--ids", "0-3")
-    assert [(hit["bus"], hit["id"], hit["baudrate"], hit["model"]) for hit in found] == [
+    hits = call.json("scan", "arm", "--ids", "0-3")
+    assert [(hit["bus"], hit["id"], hit["baudrate"], hit["model"]) for hit in hits] == [
         ("arm", 1, 1000000, "sts"),
         ("arm", 2, 1000000, "sts"),
     ]
-    assert all(hit["firmware"] for hit in found)
+    assert all(hit["firmware"] for hit in hits)
     assert call("scan", "arm", "--ids", "1-2") == 0
     assert "STS3215" in call.out
     assert call("scan", "arm", "--ids", "1-2", "--yaml") == 0
@@ -160,7 +160,7 @@ def test_scan_of_a_bare_port(call: Call) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("--ids", "5-1"), "write ids from 0 to 253"),
         (("--ids", "253-254"), "write ids from 0 to 253"),
@@ -173,16 +173,16 @@ def test_scan_of_a_bare_port(call: Call) -> None:
         ((), "say which bus: there are arm, leg"),
     ],
 )
-def test_scan_with_bad_arguments(arguments: tuple[str, ...], told: str, call: Call) -> None:
+def test_scan_with_bad_arguments(arguments: tuple[str, ...], message: str, call: Call) -> None:
     bus = ("arm",) if arguments else ()
     assert call("scan", *bus, *arguments) == 2
-    assert told in call.err
+    assert message in call.err
     assert call("scan", "foot") == 2
     assert "no bus 'foot'" in call.err
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("read", "knee"), "no servo 'knee': there are arm/shoulder"),
         (("read", "elbow"), "on several buses: say one of arm/elbow, leg/elbow"),
@@ -191,7 +191,7 @@ def test_scan_with_bad_arguments(arguments: tuple[str, ...], told: str, call: Ca
         (("move", "shoulder=91"), "outside -90 to 90"),
         (("move", "shoulder=nan"), "not a finite number"),
         (("move", "shoulder=inf"), "not a finite number"),
-        (("move", "shoulder=fast"), "'fast' is no number"),
+        (("move", "shoulder=fast"), "'fast' is not a number"),
         (("move", "shoulder"), "write NAME=POSITION"),
         (("move", "=5"), "write NAME=POSITION"),
         (("move", "knee=5"), "no servo 'knee'"),
@@ -217,9 +217,9 @@ def test_scan_with_bad_arguments(arguments: tuple[str, ...], told: str, call: Ca
         (("move", "shoulder=5", "--speed", "nan"), "not a finite number"),
     ],
 )
-def test_what_is_refused_ends_with_status_2(arguments: tuple[str, ...], told: str, call: Call) -> None:
+def test_a_wrong_request_ends_with_status_2(arguments: tuple[str, ...], message: str, call: Call) -> None:
     assert call(*arguments) == 2, call.out
-    assert told in call.err
+    assert message in call.err
     assert "Traceback" not in call.err
 
 
@@ -235,14 +235,14 @@ def test_config_from_the_environment(call: Call, rig: Path, monkeypatch: pytest.
     assert call("read", "shoulder", "id") == 0
 
 
-def test_a_port_that_is_missing_ends_with_status_1_and_touches_no_other(call: Call, rig: Path) -> None:
+def test_a_missing_port_ends_with_status_1(call: Call, rig: Path) -> None:
     rig.write_text(TWO.replace('"sim:"', "/dev/no-such-port", 1))
     assert call("read", "shoulder") == 1
     assert "servobus: arm: /dev/no-such-port does not exist" in call.err
     assert call("read", "hip") == 0
 
 
-def test_a_port_that_is_missing_keeps_no_other_bus_from_being_stopped(call: Call, rig: Path) -> None:
+def test_a_missing_port_does_not_keep_others_from_stopping(call: Call, rig: Path) -> None:
     rig.write_text(TWO.replace('"sim:"', "/dev/no-such-port", 1).replace("hip: {", "hip: {on_estop: limp, "))
     assert call("stop", "--json") == 1
     reports = json.loads(call.out)
@@ -251,7 +251,7 @@ def test_a_port_that_is_missing_keeps_no_other_bus_from_being_stopped(call: Call
     assert "/dev/no-such-port" in call.err
 
 
-def test_a_silent_servo_ends_with_status_1_and_the_others_are_told(call: Call, rig: Path) -> None:
+def test_a_silent_servo_ends_with_status_1(call: Call, rig: Path) -> None:
     text = TWO.replace('port: "sim:"', 'port: "sim:"\n    faults: {loss: 1.0}', 1)
     rig.write_text(text.replace("      elbow: {id: 2, model: sts}\n", "", 1))
     assert call("read", "--json") == 1
@@ -266,7 +266,7 @@ def test_a_silent_servo_ends_with_status_1_and_the_others_are_told(call: Call, r
     assert "leg/hip" in call.out
 
 
-def test_trace_shows_both_ways(call: Call) -> None:
+def test_trace_shows_requests_and_replies(call: Call) -> None:
     assert call("read", "shoulder", "id", "--trace") == 0
     assert "arm > ff ff 01 04 02 05 01 f2   id 1 READ 0x05 1 bytes" in call.err
     assert "arm < ff ff 01 03 00 01 fa   id 1 ok data 01" in call.err
@@ -283,8 +283,8 @@ def test_a_dry_run_opens_no_port(call: Call, rig: Path) -> None:
 
 
 def test_demo(call: Call) -> None:
-    found = call.json("demo", "--seconds", "0.5")
-    assert {name: row["errors"] for name, row in found.items()} == {"arm": 0, "base": 0, "gimbal": 0, "hand": 0}
-    assert found["arm"]["goals accepted"] == 300
+    rows = call.json("demo", "--seconds", "0.5")
+    assert {name: row["errors"] for name, row in rows.items()} == {"arm": 0, "base": 0, "gimbal": 0, "hand": 0}
+    assert rows["arm"]["goals accepted"] == 300
     assert call("demo", "--seconds", "0.5") == 0
     assert "of the line; it carries that" in call.out

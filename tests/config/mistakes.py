@@ -1,4 +1,4 @@
-"""Configs with one mistake each: name, what is changed into what, and where the problem has to point."""
+"""Configs with one mistake each: its name, the change to a good config, and the line and column of the problem."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ buses:
 
 @dataclass(frozen=True)
 class Mistake:
-    """`line` and `column` from 1; `told` must stand in the problem."""
+    """`line` and `column` from 1; `message` is a part of the problem."""
 
     before: str
     after: str
     line: int
     column: int
-    told: str
+    message: str
 
     @property
     def text(self) -> str:

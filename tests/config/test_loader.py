@@ -1,4 +1,4 @@
-"""Configs: what is accepted, and that every mistake is told at its place, quickly and in few words."""
+"""Configs: what is accepted, and that every mistake is reported at its line and column, quickly and briefly."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def test_a_config_cannot_be_changed() -> None:
 
 
 @pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_told_at_its_place(mistake: Mistake) -> None:
-    told = problem(mistake.text)
-    assert told.startswith(f"rig.yaml:{mistake.line}:{mistake.column}: "), told
-    assert mistake.told in told
-    assert len(told.splitlines()) == 1, "one mistake, one problem"
+def test_a_mistake_is_reported_with_line_and_column(mistake: Mistake) -> None:
+    message = problem(mistake.text)
+    assert message.startswith(f"rig.yaml:{mistake.line}:{mistake.column}: "), message
+    assert mistake.message in message
+    assert len(message.splitlines()) == 1, "one mistake, one problem"
 
 
-def test_all_mistakes_are_told_in_the_order_of_the_file() -> None:
+def test_mistakes_are_reported_in_the_order_of_the_file() -> None:
     text = GOOD.replace("id: 2", "id: 254").replace("feedback: 50", "feedback: -1").replace("1000000", "fast")
     lines = problem(text).splitlines()
     assert [int(line.split(":")[1]) for line in lines] == [6, 7, 10]
@@ -69,12 +69,12 @@ def test_one_mistake_hides_no_other() -> None:
 
 def test_a_mistake_of_a_bus_hides_no_mistake_of_the_next() -> None:
     text = two_buses("/dev/ttyS77", "/dev/ttyS77").replace("    baudrate", "    baud: 1\n    baudrate", 1)
-    told = problem(text)
-    assert "rig.yaml:6:5: buses.left.baud: unknown key" in told
-    assert "rig.yaml:10:11: buses.right.port: found the port of bus left again" in told
+    message = problem(text)
+    assert "rig.yaml:6:5: buses.left.baud: unknown key" in message
+    assert "rig.yaml:10:11: buses.right.port: found the port of bus left again" in message
 
 
-def test_a_file_with_very_many_mistakes_is_not_told_in_full() -> None:
+def test_only_the_first_of_many_mistakes_are_reported() -> None:
     text = "version: 1\nbuses:\n" + "".join(f"  b{number}: 7\n" for number in range(100))
     lines = problem(text).splitlines()
     assert len(lines) == MOST + 1
@@ -82,7 +82,7 @@ def test_a_file_with_very_many_mistakes_is_not_told_in_full() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "found nothing; a config begins with"),
         ("[]", "a config begins with `version: 1`"),
@@ -98,11 +98,11 @@ def test_a_file_with_very_many_mistakes_is_not_told_in_full() -> None:
         ("version: 1\nbusses: {}\nbuses: {}", "busses: unknown key; there are version, buses"),
     ],
 )
-def test_what_is_no_config(text: str, told: str) -> None:
-    assert told in problem(text)
+def test_a_document_that_is_not_a_config(text: str, message: str) -> None:
+    assert message in problem(text)
 
 
-def test_servos_that_are_no_servos() -> None:
+def test_values_that_are_not_servos() -> None:
     assert "found no keys here; there are id, model" in problem(GOOD.replace("{id: 2, model: sts}", "7"))
     assert "servos: found no keys here" in problem(re.sub(r"servos:(.|\n)*", "servos: 7\n", GOOD))
     assert "found 1 of its values; write 2 or more" in problem(GOOD.replace("[-90, 90]", "[-90]"))
@@ -118,8 +118,8 @@ def two_buses(first: str, second: str) -> str:
 
 
 def test_two_buses_on_one_port() -> None:
-    told = problem(two_buses("/dev/ttyS77", "/dev/ttyS77"))
-    assert told.startswith("rig.yaml:9:11: buses.right.port: found the port of bus left again")
+    message = problem(two_buses("/dev/ttyS77", "/dev/ttyS77"))
+    assert message.startswith("rig.yaml:9:11: buses.right.port: found the port of bus left again")
 
 
 def test_two_buses_on_one_port_by_two_names(tmp_path: Path) -> None:
@@ -132,15 +132,13 @@ def test_two_simulated_buses_are_two_lines() -> None:
     assert len(parse_config(two_buses('"sim:"', '"sim:"'), "rig.yaml").buses) == 2
 
 
-@pytest.mark.parametrize(
-    ("key", "greatest", "beyond"), [("torque_limit", "100", "100.1"), ("limits", "[0, 2699.9]", "[0, 2700]")]
-)
-def test_what_the_model_cannot_do_at_its_edge(key: str, greatest: str, beyond: str) -> None:
-    parse_config(GOOD.replace("id: 2,", f"id: 2, {key}: {greatest},"), "rig.yaml")
+@pytest.mark.parametrize(("key", "largest", "beyond"), [("torque_limit", "100", "100.1"), ("limits", "[0, 2699.9]", "[0, 2700]")])
+def test_the_limits_of_a_model_at_their_edges(key: str, largest: str, beyond: str) -> None:
+    parse_config(GOOD.replace("id: 2,", f"id: 2, {key}: {largest},"), "rig.yaml")
     assert f"elbow.{key}" in problem(GOOD.replace("id: 2,", f"id: 2, {key}: {beyond},"))
 
 
-def test_a_model_that_has_no_acceleration_says_so() -> None:
+def test_acceleration_of_a_model_without_it_is_refused() -> None:
     text = GOOD.replace("id: 2, model: sts", "id: 2, model: scs, acceleration: 100")
     assert "model scs has none" in problem(text)
 
@@ -158,7 +156,7 @@ def test_a_model_file_beside_the_config(tmp_path: Path) -> None:
         load_config(tmp_path / "rig.yaml")
 
 
-def test_mistakes_in_a_model_file_are_told_once(tmp_path: Path) -> None:
+def test_mistakes_in_a_model_file_are_reported_once(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("extends: sts\nregisters: {lock: {adress: 5}, id: {size: 3}}\n")
     (tmp_path / "rig.yaml").write_text(GOOD.replace("model: sts", "model: mine.yaml"))
     with pytest.raises(ConfigError) as caught:
@@ -169,7 +167,7 @@ def test_mistakes_in_a_model_file_are_told_once(tmp_path: Path) -> None:
     assert third.endswith("rig.yaml:10:29: buses.arm.servos.elbow.model: cannot be used, see shoulder")
 
 
-def test_a_model_that_is_refused_hides_no_other_mistake() -> None:
+def test_a_refused_model_hides_no_other_mistake() -> None:
     text = GOOD.replace("id: 1, model: sts", "id: 1, model: stx").replace("id: 2,", "id: 2, unit: feet,")
     assert [line.split(":")[1] for line in problem(text).splitlines()] == ["9", "10"]
 
@@ -195,7 +193,7 @@ def test_there_are_examples() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.yaml")} >= {"arm", "rs485", "sim"}
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="there is no such file"):
         load_config(tmp_path / "none.yaml")
     with pytest.raises(ConfigError, match="this is a directory"):

@@ -93,4 +93,4 @@ def test_a_config_that_is_wrong_is_not_installed(tmp_path: Path) -> None:
 def test_a_config_that_is_not_there_yet_is_said(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["install-service", str(tmp_path / "later.yaml")])
     assert result.exit_code == 0
-    assert "is not there yet" in result.output
+    assert "does not exist yet" in result.output

@@ -1,4 +1,4 @@
-"""The YAML reader itself: scalars, places, and each thing it refuses. Attacks stand in test_config.py."""
+"""The YAML reader: scalars, lines and columns, and everything that it refuses. Attacks: tests/config/test_attacks.py."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from servobus.errors import ConfigError
     ],
 )
 def test_scalars(text: str, value: object) -> None:
-    found = parse(f"a: {text}", "f").data["a"]
-    assert (found, type(found)) == (value, type(value))
+    parsed = parse(f"a: {text}", "f").data["a"]
+    assert (parsed, type(parsed)) == (value, type(value))
 
 
 def test_places() -> None:
@@ -54,7 +54,7 @@ def test_windows_line_ends_and_a_first_marker() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("%YAML 1.2\n---\na: 1", "1:1: found a YAML directive"),
         ("a: 1\n---\nb: 2", "2:1: found ---"),
@@ -80,17 +80,17 @@ def test_windows_line_ends_and_a_first_marker() -> None:
         ("a: \u202e", "U+202E"),
     ],
 )
-def test_what_is_refused(text: str, told: str) -> None:
+def test_what_is_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse(text, "f")
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).startswith("f:")
 
 
 def test_sizes_at_their_edges() -> None:
-    at_most = "a: " + "x" * (MAX_BYTES - 3)
-    assert len(parse(at_most, "f").data["a"]) == MAX_BYTES - 3
-    for more in (at_most + "x", (at_most + "x").encode(), "a: " + "ä" * MAX_BYTES):
+    largest = "a: " + "x" * (MAX_BYTES - 3)
+    assert len(parse(largest, "f").data["a"]) == MAX_BYTES - 3
+    for more in (largest + "x", (largest + "x").encode(), "a: " + "ä" * MAX_BYTES):
         with pytest.raises(ConfigError, match="more than 65536 bytes"):
             parse(more, "f")
     nested = "[" * (MAX_DEPTH - 1) + "]" * (MAX_DEPTH - 1)
@@ -105,7 +105,7 @@ def test_sizes_at_their_edges() -> None:
         parse("\n".join(f"k{n}: 1" for n in range(MAX_NODES // 2 + 1)), "f")
 
 
-def test_the_greatest_integers() -> None:
+def test_the_largest_integer() -> None:
     assert parse("a: 9223372036854775807", "f").data["a"] == 2**63 - 1
 
 
@@ -121,7 +121,7 @@ def test_files(tmp_path: Path) -> None:
         read("a\0b")
 
 
-def test_what_is_shown_is_short_and_harmless() -> None:
+def test_clipped_text_is_short_and_printable() -> None:
     assert clip("abc", 3) == "abc"
     assert clip("abcd", 3) == "..."
     assert clip("x" * 100, 10) == "xxxxxxx..."
