@@ -127,7 +127,7 @@ def conversation(joined: Joined) -> None:
 
 
 def check_codec(joined: Joined) -> None:
-    """Frames are found in any pieces; garbage between them is skipped and counted; zeros are never kept."""
+    """Frames are found in any pieces, garbage between them is skipped and counted, and little is kept of endless garbage."""
     conversation(joined)
     rng = random.Random(1)
     for codec_of, frames in ((joined.definition.codec, joined.replies), (joined.definition.device_codec, joined.requests)):
@@ -139,6 +139,12 @@ def check_codec(joined: Joined) -> None:
             assert [reply.frame for reply in decode(codec, delivery)] == frames
             assert (codec.pending, codec.skipped) == (0, 0)
         codec = codec_of(joined.options)
+        garbage = b"\x00" * 3
+        noisy = [piece for frame in frames for piece in (garbage, frame)]
+        assert [reply.frame for reply in decode(codec, noisy)] == frames
+        assert codec.skipped == len(garbage) * len(frames)
+        assert decode(codec, [b"\x00" * 100] * 20) == []
+        codec.reset()
         codec.receive_data(frames[0][:-1])
         codec.reset()
         assert [reply.frame for reply in decode(codec, [frames[0]])] == frames[:1]
