@@ -18,7 +18,7 @@ LOCK, DELAY = 55, 7
 
 
 @pytest.mark.parametrize("model", ["sms", "sms_cl", "sts", "scs"])
-def test_enable_makes_the_present_position_the_goal_before_torque(model: str) -> None:
+def test_enable_writes_the_present_position_before_torque(model: str) -> None:
     bench = Bench({"a": {"id": 1, "model": model}})
     device = bench.devices[1]
     device.joint.position = 700.0

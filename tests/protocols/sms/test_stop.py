@@ -160,7 +160,7 @@ def test_nobody_to_stop() -> None:
     assert stop(Bench(TWO)) == {}
 
 
-def test_a_preview_of_a_stop_is_what_leaves_before_the_first_reply() -> None:
+def test_a_preview_of_a_stop_ends_at_the_first_reply() -> None:
     bench = Bench()
     targets = [target("a", position=10.0), target("b", position=-10.0)]
     frames = [request.frame for request in bench.driver.preview_stop(targets)]
