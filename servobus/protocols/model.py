@@ -129,8 +129,7 @@ class ServoModel(Data):
     def _name_registers(cls, data: Any) -> Any:
         if isinstance(data, Mapping) and isinstance(data.get("registers"), Mapping):
             named = {
-                name: {"name": name, **entry} if isinstance(entry, Mapping) else entry
-                for name, entry in data["registers"].items()
+                name: {"name": name, **keys} if isinstance(keys, Mapping) else keys for name, keys in data["registers"].items()
             }
             return {**data, "registers": named}
         return data

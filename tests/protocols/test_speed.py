@@ -51,6 +51,6 @@ def test_speed_0_is_refused_unless_the_config_allows_it() -> None:
         speed_of(Goal("position", 10.0, speed=0.0))
 
 
-def test_a_duration_without_a_known_position_is_refused() -> None:
+def test_a_duration_without_a_position_is_refused() -> None:
     with pytest.raises(LimitError, match="a duration needs the present position"):
         speed_of(Goal("position", 10.0, duration=1.0), None)

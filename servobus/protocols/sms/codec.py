@@ -63,9 +63,9 @@ class Packet(NamedTuple):
         return len(self.params)
 
 
-def checksum(body: bytes) -> int:
+def checksum(content: bytes) -> int:
     """Return the inverted low byte of the sum of all bytes between header and checksum."""
-    return ~sum(body) & 0xFF
+    return ~sum(content) & 0xFF
 
 
 def encode(servo_id: int, code: int, params: bytes = b"") -> bytes:
@@ -74,8 +74,8 @@ def encode(servo_id: int, code: int, params: bytes = b"") -> bytes:
         raise ValueError(f"id {servo_id} is outside 0 to {MAX_ID} (or {BROADCAST_ID} for all)")
     if len(params) > MAX_PARAMETERS:
         raise ValueError(f"{len(params)} parameters do not fit in a packet of at most {MAX_PARAMETERS}")
-    body = bytes((servo_id, len(params) + 2, code)) + params
-    return HEADER + body + bytes((checksum(body),))
+    content = bytes((servo_id, len(params) + 2, code)) + params
+    return HEADER + content + bytes((checksum(content),))
 
 
 class SmsCodec(StreamCodec[Packet]):

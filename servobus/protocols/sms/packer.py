@@ -76,11 +76,11 @@ class GoalPacker:
         if settings is None:
             settings = self.missing_settings(goal.goal)
         layout = self._layout(tuple(settings))
-        words = self._position_words(goal) if servo.fit.mode == "position" else self._velocity_words(goal.goal)
+        values = self._position_values(goal) if servo.fit.mode == "position" else self._velocity_values(goal.goal)
         if settings:
-            before, after = (self._setting_words(names, settings) for names in (layout.before, layout.after))
-            words = (*before, *words, *after)
-        data = layout.pack(*words)
+            before, after = (self._setting_values(names, settings) for names in (layout.before, layout.after))
+            values = (*before, *values, *after)
+        data = layout.pack(*values)
         return PackedGoal(servo, layout.address, data, settings, goal.goal, goal.start, servo.fit, servo.held)
 
     def first_goal(self, present: int) -> tuple[int, bytes]:
@@ -88,8 +88,8 @@ class GoalPacker:
         layout = self._layout(())
         if self.servo.fit.mode == "velocity":
             return layout.address, layout.pack(0)
-        words = self._position(present), self._time(self.rest_time), self._speed(self.default_speed)
-        return layout.address, layout.pack(*words)
+        values = self._position(present), self._time(self.rest_time), self._speed(self.default_speed)
+        return layout.address, layout.pack(*values)
 
     # Settings beside the goal
 
@@ -127,18 +127,18 @@ class GoalPacker:
             raise NotSupported(text, servo=self.servo.name)
         return register
 
-    def _setting_words(self, names: tuple[str, ...], settings: Mapping[str, int]) -> list[int]:
+    def _setting_values(self, names: tuple[str, ...], settings: Mapping[str, int]) -> list[int]:
         registers = self.servo.model.registers
         return [self.servo.word_maker(registers[name])(settings[name]) for name in names]
 
-    # Words
+    # Values of the goal registers
 
-    def _position_words(self, goal: ServoGoal) -> tuple[int, ...]:
+    def _position_values(self, goal: ServoGoal) -> tuple[int, ...]:
         position = self._position(self.servo.calibration.to_raw(goal.goal.value))
         time, speed = self._time_and_speed(goal)
         return position, self._time(time), self._speed(speed)
 
-    def _velocity_words(self, goal: Goal) -> tuple[int, ...]:
+    def _velocity_values(self, goal: Goal) -> tuple[int, ...]:
         return (self._speed(self.servo.to_raw(self.servo.speed, goal.value)),)
 
     def _time_and_speed(self, goal: ServoGoal) -> tuple[int, int]:

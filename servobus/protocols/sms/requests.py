@@ -153,8 +153,8 @@ class SyncWrite(Acknowledged):
         if len(sizes) != 1 or 0 in sizes:
             raise ValueError(f"SYNC WRITE needs the same number of bytes for each servo, found {sorted(sizes)}")
         size = sizes.pop()
-        body = b"".join(bytes((node,)) + part for node, part in data.items())
-        super().__init__(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, size)) + body, answered=False)
+        blocks = b"".join(bytes((node,)) + part for node, part in data.items())
+        super().__init__(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, size)) + blocks, answered=False)
 
 
 class SyncRead(SmsRequest[R]):

@@ -136,7 +136,7 @@ class HostServo:
             for field, register in ((field, self.model.registers[name]) for field, name in self.model.state.items())
             if start <= register.address and register.end <= start + size
         ]
-        fields.sort(key=lambda entry: entry[1].address)
+        fields.sort(key=lambda field: field[1].address)
         unpackers = []
         while fields:
             # Registers that overlap an earlier one are unpacked once more; the packaged models have none.

@@ -68,9 +68,9 @@ def master_of(name: str = "sts", servo_id: int = 1, **options: int) -> Master:
 def changed(name: str, **registers: dict[str, object] | None) -> SmsModel:
     """A model with some registers changed, added, or (None) taken out."""
     data = model_of(name).model_dump()
-    for register, entry in registers.items():
-        if entry is None:
+    for register, keys in registers.items():
+        if keys is None:
             del data["registers"][register]
         else:
-            data["registers"][register] = {**data["registers"].get(register, {}), **entry}
+            data["registers"][register] = {**data["registers"].get(register, {}), **keys}
     return SmsModel.model_validate(data)

@@ -79,7 +79,7 @@ def test_no_frame_holds_the_line_longer_than_allowed(baudrate: int, size: int) -
     assert size * 10 / baudrate <= MAX_FRAME_SECONDS
 
 
-def test_a_frame_carries_at_least_one_servo() -> None:
+def test_a_frame_carries_one_servo_or_more() -> None:
     bench = Bench(baudrate=9600)
     bench.enable()
     assert set(bench.move({"a": 1, "b": 1}).values()) == {Outcome.ACKED}
