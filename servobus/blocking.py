@@ -1,87 +1,54 @@
 """The same rigs for scripts and notebooks: every verb waits until it is done.
 
-A thread of its own runs the client, so that leases are renewed while the script computes. A rig may be used from several threads.
-Left by an exception, or with the process, the servos moved from here do their `on_lost_client`.
+The rig lives in the event loop of a thread of its own (anyio's BlockingPortal), so that leases are renewed while the script
+computes. It may be used from several threads. Left by an exception, or with the process, the servos moved from here do their
+`on_lost_client`.
 """
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import threading
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Coroutine, Generator, Iterator, Mapping
-from concurrent.futures import CancelledError, Future
-from contextlib import AbstractAsyncContextManager, suppress
+from collections.abc import AsyncIterator, Callable, Collection, Generator, Iterator, Mapping
+from concurrent.futures import CancelledError
+from contextlib import AbstractAsyncContextManager, ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Self, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar
+
+from anyio.from_thread import start_blocking_portal
 
 from servobus.errors import LinkDown
-from servobus.remote import rig as client
+from servobus.remote import rig as remote
+from servobus.rig.blocking_verbs import RigVerbs, ServoVerbs
 from servobus.rig.events import Event
 from servobus.rig.interface import Rig, Servo
 from servobus.values import Snapshot
 
-if TYPE_CHECKING:
-    from servobus.config.loader import Config
-
 P = ParamSpec("P")
 R = TypeVar("R")
-T = TypeVar("T")
-
-
-class _Left(Exception):
-    pass
 
 
 class _Thread:
     """An event loop in a thread, and in it the context of one rig."""
 
-    def __init__(self, rig: Callable[[], AbstractAsyncContextManager[Rig]]) -> None:
-        self._ready: Future[Rig] = Future()
-        self._failure: BaseException | None = None
+    def __init__(self, context: AbstractAsyncContextManager[Rig]) -> None:
         self._closing = threading.Lock()
-        self._loop = asyncio.new_event_loop()
-        self._leave: asyncio.Future[None] = self._loop.create_future()
-        self._thread = threading.Thread(target=self._serve, args=(rig,), name="servobus", daemon=True)
-        self._thread.start()
+        with ExitStack() as stack:
+            self._portal = stack.enter_context(start_blocking_portal(name="servobus"))
+            self._ident = self._portal.call(threading.get_ident)
+            stack.callback(self._portal.call, self._portal.stop, True)  # ends what other threads wait for
+            self.rig = stack.enter_context(self._portal.wrap_async_context_manager(context))
+            self._contexts = stack.pop_all()
+
+    def wait(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call a function in the loop and wait for its result. Ctrl-C ends the waiting, and the call with it."""
+        if threading.get_ident() == self._ident:
+            raise RuntimeError("a callback of this rig runs in its own thread and may not wait for it: use another thread")
         try:
-            self.rig = self._ready.result()
-        except BaseException:  # it cannot be opened, or Ctrl-C came before it was
-            with suppress(RuntimeError):  # it has ended already
-                self._loop.call_soon_threadsafe(self._give_up)
-            self._thread.join()
-            raise
-
-    def _serve(self, rig: Callable[[], AbstractAsyncContextManager[Rig]]) -> None:
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._main(rig))
-
-    def _give_up(self) -> None:
-        for task in asyncio.all_tasks(self._loop):
-            task.cancel()
-
-    async def _main(self, rig: Callable[[], AbstractAsyncContextManager[Rig]]) -> None:
-        try:
-            async with rig() as opened:
-                self._ready.set_result(opened)
-                await self._leave
-        except _Left:
-            pass
-        except BaseException as error:  # noqa: BLE001 - it is raised where the rig was wanted, or is left
-            self._failure = error
-            if not self._ready.done():
-                self._ready.set_exception(error)
-
-    def run(self, work: Coroutine[Any, Any, R]) -> R:
-        """Do it in the loop. Ctrl-C ends the waiting, and the work with it."""
-        if threading.current_thread() is self._thread:
-            work.close()
-            raise RuntimeError("a callback of this rig runs in its own thread, and may not wait for it: hand the work to another")
-        if self._leave.done() or not self._thread.is_alive():
-            work.close()
-            raise LinkDown("this rig was left: nothing was sent")
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+            future = self._portal.start_task_soon(functools.partial(function, *args, **kwargs))
+        except RuntimeError:
+            raise LinkDown("this rig was left: nothing was sent") from None
         try:
             return future.result()
         except CancelledError:
@@ -90,164 +57,115 @@ class _Thread:
             future.cancel()
             raise
 
-    def close(self, *, lost: bool) -> None:
-        if not self._closing.acquire(blocking=False):
-            return  # it is left already
-        self._loop.call_soon_threadsafe(self._end, lost)
-        self._thread.join()
-        if self._failure is not None:
-            raise self._failure
-
-    def _end(self, lost: bool) -> None:
-        if lost:
-            self._leave.set_exception(_Left())
-        else:
-            self._leave.set_result(None)
+    def close(
+        self, kind: type[BaseException] | None = None, error: BaseException | None = None, trace: TracebackType | None = None
+    ) -> None:
+        if self._closing.acquire(blocking=False):  # else it is left already
+            self._contexts.__exit__(kind, error, trace)
 
 
-class _Blocking(Generic[T]):
-    """Something whose verbs are awaited, for those who cannot."""
+class BlockingServo(ServoVerbs):
+    """One servo: the verbs of `servobus.Servo`, each of which waits until it is done."""
 
-    def __init__(self, inner: T, thread: _Thread) -> None:
-        self._inner = inner
-        self._thread = thread
-
-
-def _verb(verb: Callable[Concatenate[T, P], Coroutine[Any, Any, R]]) -> Callable[Concatenate[_Blocking[T], P], R]:
-    @functools.wraps(verb)
-    def wait(self: _Blocking[T], /, *args: P.args, **kwargs: P.kwargs) -> R:
-        result: R = self._thread.run(getattr(self._inner, verb.__name__)(*args, **kwargs))
-        return result
-
-    return wait
-
-
-class BlockingServo(_Blocking[Servo]):
-    """One servo; the verbs of `servobus.Servo`."""
+    def __init__(self, inner: Servo, thread: _Thread) -> None:
+        self.inner = inner
+        self.wait = thread.wait
 
     @property
     def name(self) -> str:
-        return self._inner.name
+        """Its full name, "bus/servo"."""
+        return self.inner.name
 
     def __repr__(self) -> str:
         return f"<BlockingServo {self.name}>"
 
-    move_to = _verb(Servo.move_to)
-    spin = _verb(Servo.spin)
-    settle = _verb(Servo.settle)
-    enable = _verb(Servo.enable)
-    disable = _verb(Servo.disable)
-    read = _verb(Servo.read)
-    read_register = _verb(Servo.read_register)
-    write_register = _verb(Servo.write_register)
-    ping = _verb(Servo.ping)
-    identify = _verb(Servo.identify)
 
+class BlockingRig(RigVerbs):
+    """A rig: the verbs of `servobus.Rig`, each of which waits until it is done. In use until `close`, or as a context."""
 
-class BlockingRig(_Blocking[Rig]):
-    """A rig; the verbs of `servobus.Rig`. In use until `close`, or as a context."""
-
-    move = _verb(Rig.move)
-    send = _verb(Rig.send)
-    send_all = _verb(Rig.send_all)
-    enable = _verb(Rig.enable)
-    disable = _verb(Rig.disable)
-    stop = _verb(Rig.stop)
-    clear = _verb(Rig.clear)
-    settle = _verb(Rig.settle)
-    read = _verb(Rig.read)
-    read_register = _verb(Rig.read_register)
-    write_register = _verb(Rig.write_register)
-    ping = _verb(Rig.ping)
-    identify = _verb(Rig.identify)
-    scan = _verb(Rig.scan)
-    set_id = _verb(Rig.set_id)
-    set_baudrate = _verb(Rig.set_baudrate)
-    command = _verb(Rig.command)
-    acquire = _verb(Rig.acquire)
-    release = _verb(Rig.release)
-    reload = _verb(Rig.reload)
+    def __init__(self, thread: _Thread) -> None:
+        self.inner = thread.rig
+        self.wait = thread.wait
+        self._thread = thread
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._thread.close(lost=kind is not None)
+        self._thread.close(kind, error, trace)
 
     def close(self) -> None:
-        """As at the normal end of the context."""
-        self._thread.close(lost=False)
+        """Leave the rig, as at the normal end of its context. A second call does nothing."""
+        self._thread.close()
 
     def __getitem__(self, name: str) -> BlockingServo:
-        return BlockingServo(self._inner[name], self._thread)
+        return BlockingServo(self.inner[name], self._thread)
 
     def __iter__(self) -> Iterator[BlockingServo]:
-        return iter([BlockingServo(servo, self._thread) for servo in self._inner])
+        return iter([BlockingServo(servo, self._thread) for servo in self.inner])
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
-        return self._inner.names
+        """Full name -> (bus, servo), in the order of the config."""
+        return self.inner.names
 
     @property
     def stopped(self) -> bool:
-        return self._inner.stopped
+        """Whether the e-stop is latched."""
+        return self.inner.stopped
 
     def snapshot(self) -> Snapshot:
-        return self._inside(self._inner.snapshot)
+        """Return the last known state of every servo, without a turn."""
+        states: Snapshot = self.wait(self.inner.snapshot)
+        return states
 
     def stats(self) -> dict[str, Any]:
-        return self._inside(self._inner.stats)
-
-    def _inside(self, look: Callable[[], R]) -> R:
-        """In the rig's own thread, where nothing changes meanwhile."""
-
-        async def inside() -> R:
-            return look()
-
-        return self._thread.run(inside())
+        """Return counters and latencies, by bus: see `Rig.stats`."""
+        stats: dict[str, Any] = self.wait(self.inner.stats)
+        return stats
 
     def watch(self, hz: float = 10.0) -> Generator[Snapshot, None, None]:
-        """As `Rig.watch`, for a plain `for`."""
-        return self._each(self._inner.watch(hz))
+        """Yield snapshots `hz` times a second: see `Rig.watch`."""
+        return self._each(self.inner.watch(hz))
 
     def events(self) -> Generator[Event, None, None]:
-        """As `Rig.events`, for a plain `for`."""
-        return self._each(self._inner.events())
+        """Yield what happens from this call on: see `Rig.events`."""
+        return self._each(self.wait(self.inner.events))
 
     def _each(self, items: AsyncIterator[R]) -> Generator[R, None, None]:
-        async def following() -> R:
-            return await anext(items)
-
-        async def end() -> None:
-            if isinstance(items, AsyncGenerator):
-                await items.aclose()
-
         try:
             while True:
                 try:
-                    item = self._thread.run(following())
+                    item: R = self.wait(anext, items)
                 except StopAsyncIteration:
                     return
                 yield item
         finally:
             with suppress(LinkDown):
-                self._thread.run(end())
+                self.wait(items.aclose)  # type: ignore[attr-defined]
 
 
-def _waiting(rig: Callable[P, AbstractAsyncContextManager[Rig]]) -> Callable[P, BlockingRig]:
-    @functools.wraps(rig)
-    def wait(*args: P.args, **kwargs: P.kwargs) -> BlockingRig:
-        thread = _Thread(lambda: rig(*args, **kwargs))
-        return BlockingRig(thread.rig, thread)
+def _blocking(make: Callable[P, AbstractAsyncContextManager[Rig]]) -> Callable[P, BlockingRig]:
+    @functools.wraps(make)
+    def call(*args: P.args, **kwargs: P.kwargs) -> BlockingRig:
+        return BlockingRig(_Thread(make(*args, **kwargs)))
 
-    return wait
-
-
-connect = _waiting(client.connect)
+    return call
 
 
-def open(config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
-    """A rig whose ports this process owns: `servobus.open`."""
-    from servobus.rig.local import open_rig  # the engine, which a client does without
+connect = _blocking(remote.connect)
 
-    return _waiting(open_rig)(config, buses=buses, degraded=degraded)
+
+def open(config: Any, *, buses: Collection[str] = (), degraded: bool = False) -> BlockingRig:
+    """Own the ports of a config until the rig is closed; then each servo enabled here is left as its `on_exit` says.
+
+    Args:
+        config: Path of the YAML file (str or Path), or a loaded Config.
+        buses: Names of the buses to open; none: all.
+        degraded: True: a port that cannot be opened is waited for; False: it raises.
+
+    Raises: ConfigError, PortMissing, PortBusy, PortDenied, LinkDown.
+    """
+    from servobus.rig.local import open_rig  # the engine, which a client of a daemon does not need
+
+    return _blocking(open_rig)(Path(config) if isinstance(config, str) else config, buses=buses, degraded=degraded)

@@ -1,6 +1,6 @@
-"""What is said about servos, whatever their protocol: goals and their outcomes, states, identities, stops. Plain frozen data.
+"""The values that every package shares, whatever the protocol: goals and outcomes, states, identities, stops. Plain frozen data.
 
-Positions are in the servo's unit, speeds in unit/s, times in seconds.
+Positions are in the servo's unit (degrees unless its model or its config says otherwise), speeds in unit/s, times in seconds.
 """
 
 from __future__ import annotations
@@ -63,25 +63,26 @@ class EventName(StrEnum):
 
 
 class Outcome(StrEnum):
-    """How a goal ended that did not fail."""
+    """How a goal ended that did not fail.
+
+    ACKED: the servo confirmed it. SENT: it was sent, and the protocol has no reply to it. SUPERSEDED: a newer goal of the same
+    servo replaced it before it was sent.
+    """
 
     ACKED = "acked"
-    """The servo confirmed it."""
     SENT = "sent"
-    """It left, and the protocol has no answer to it."""
     SUPERSEDED = "superseded"
-    """A newer goal of the same servo took its place before it left."""
 
 
-class Health(StrEnum):
-    """What servobus believes of a node."""
+class Health(Described):
+    """Whether a node answers.
 
-    ONLINE = "online"
-    """It answers what it is asked."""
-    DOUBTFUL = "doubtful"
-    """A reply is missing or came unasked; a fence comes before the next request to it."""
-    OFFLINE = "offline"
-    """It missed several replies in a row. It is probed with growing pauses, and nobody waits for it."""
+    ONLINE: it answers. DOUBTFUL: a reply is missing or came unasked. OFFLINE: it missed several replies in a row.
+    """
+
+    ONLINE = "online", "The node answers what it is asked."
+    DOUBTFUL = "doubtful", "A reply is missing or came unasked; a fence comes before the next request to the node."
+    OFFLINE = "offline", "The node missed several replies in a row; it is probed with growing pauses, and nothing waits for it."
 
 
 GoalKind: TypeAlias = Literal["position", "velocity"]
@@ -89,20 +90,25 @@ GoalKind: TypeAlias = Literal["position", "velocity"]
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Where a servo shall go. Positions in the servo's unit, speeds in unit/s, times in seconds."""
+    """Where a servo is to go.
+
+    Attributes:
+        kind: "position" or "velocity".
+        value: The position in the servo's unit, or the velocity in unit/s (the sign is the direction).
+        speed: Speed on the way, in unit/s; None: the servo's own.
+        duration: Seconds the motion is to take; not together with `speed`.
+        acceleration: In unit/s^2; None: the servo's own.
+        effort: In percent of the greatest torque; None: the servo's own.
+        start_within: Seconds within which the first byte must leave; None: the servo's `ttl`.
+    """
 
     kind: GoalKind
     value: float
     speed: float | None = None
-    """Unit/s on the way; None: the servo's own setting."""
     duration: float | None = None
-    """Seconds the way shall take; not together with speed."""
     acceleration: float | None = None
-    """Unit/s^2; None: the servo's own setting."""
     effort: float | None = None
-    """Percent of the greatest torque."""
     start_within: float | None = None
-    """Seconds from acceptance within which its first byte must leave; None: the servo's `ttl`."""
 
 
 GOAL_NUMBERS = ("value", "speed", "duration", "acceleration", "effort", "start_within")
@@ -111,7 +117,7 @@ GOAL_NUMBERS = ("value", "speed", "duration", "acceleration", "effort", "start_w
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """position = direction * (raw - zero) * unit_per_step, as DESIGN section 7 rules."""
+    """position = direction * (raw - zero) * unit_per_step, with raw in steps."""
 
     zero: float
     direction: int
@@ -121,7 +127,7 @@ class Calibration:
         return self.direction * (raw - self.zero) * self.unit_per_step + 0.0  # never -0.0
 
     def to_raw(self, position: float) -> int:
-        """Nearest step, ties to even."""
+        """The nearest step, ties to even."""
         return round(self.zero + self.direction * position / self.unit_per_step)
 
     def rate_to_unit(self, steps: float) -> float:
@@ -134,12 +140,29 @@ class Calibration:
 
 
 Update: TypeAlias = dict[str, Any]
-"""Fields of `State` as one reply brought them."""
+"""Fields of `State` that one reply brought."""
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What is known of a servo. Absent is None. Position, goal in its unit; speed unit/s; load %; A; V; Celsius."""
+    """What is known of a servo. A field that is not known is None.
+
+    Attributes:
+        position: In the servo's unit.
+        goal: The position that the servo itself holds as its goal, in its unit.
+        speed: In unit/s, with the direction.
+        load: In percent of the greatest torque, with the direction.
+        current: In A, with the direction.
+        voltage: In V.
+        temperature: In degrees Celsius.
+        moving: Whether the servo says that it moves.
+        enabled: Whether its torque was switched on here.
+        faults: Names of the faults that it reports.
+        status: The status byte from which they are taken.
+        health: Whether its node answers.
+        time: Monotonic seconds of the newest field.
+        age: Seconds from `time` to when this State was made.
+    """
 
     position: float | None = None
     goal: float | None = None
@@ -153,11 +176,8 @@ class State:
     faults: tuple[str, ...] = ()
     status: int | None = None
     health: Health = Health.OFFLINE
-    """Whether its node answers."""
     time: float | None = None
-    """Monotonic seconds of the newest field."""
     age: float | None = None
-    """Seconds since `time` when this was made."""
 
 
 Snapshot = dict[str, State]
@@ -204,18 +224,25 @@ class Reload:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a servo says of itself; None where the protocol does not tell."""
+    """What a servo says of itself. A field that its protocol does not have is None.
+
+    Attributes:
+        model: Name of a model file that fits.
+        product: Its product name or number.
+        firmware: Its firmware version.
+        mode: "position" or "velocity".
+        energised: Whether its torque is on, whoever switched it on.
+        limits: Its own stored limits, in its unit.
+        notes: Settings that do not fit the config, for a person.
+    """
 
     model: str | None = None
-    """Name of a model file that fits."""
     product: str | None = None
     firmware: str | None = None
     mode: GoalKind | None = None
     energised: bool | None = None
     limits: tuple[float, float] | None = None
-    """The servo's own stored limits, in its unit."""
     notes: tuple[str, ...] = ()
-    """What a person should know: settings that do not fit the config."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,10 +275,16 @@ class StopTarget:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """What an e-stop, a disable or an exit did to one servo."""
+    """What an e-stop, a disable or an exit did to one servo.
+
+    Attributes:
+        action: hold, limp, park, or none (its torque was off already).
+        written: Whether the request was sent.
+        confirmed: Whether its effect was read back.
+        detail: What a person should know.
+    """
 
     action: str
-    """hold, limp, park, or none (it was limp already)."""
     written: bool
     confirmed: bool
     detail: str = ""
@@ -259,15 +292,22 @@ class StopReport:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What was changed, and whether the servo goes by it already."""
+    """What was changed by `set_id` or `set_baudrate`, and whether it is in effect.
+
+    Attributes:
+        node: The id at which it was changed.
+        what: "id" or "baudrate".
+        value: The new id or rate.
+        saved: Whether it is kept through a restart.
+        pending_reboot: Whether it only takes effect when the servo is saved and restarted.
+        notes: What a person should know.
+    """
 
     node: int
-    """Where it was changed."""
     what: Literal["id", "baudrate"]
     value: int
     saved: bool = False
     pending_reboot: bool = True
-    """It takes effect when the servo is saved and restarted; until then it answers as before."""
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -276,23 +316,23 @@ class Change:
 
 
 class Role(IntEnum):
-    """In the order of what they may."""
+    """What a client of a daemon may do; each role includes the lower ones."""
 
     NOBODY = 0
-    """Has not shown a token yet."""
+    """It has not shown a token yet."""
     OBSERVER = 1
-    """Reads, and stops: anyone may stop."""
+    """It reads, and it stops: anyone may stop."""
     OPERATOR = 2
-    """Moves."""
+    """It moves servos."""
     ADMIN = 3
-    """Changes what stays: ids, rates, EEPROM, the config."""
+    """It changes what is kept: ids, rates, EEPROM, the config."""
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
 def is_number(value: object) -> bool:
-    """A finite number that is no boolean."""
+    """Whether the value is a finite number, and not a boolean."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     try:
@@ -302,13 +342,13 @@ def is_number(value: object) -> bool:
 
 
 def no_number(what: str, value: object) -> str:
-    """What to say of a value that `is_number` refuses."""
+    """The message about a value that `is_number` refuses."""
     huge = isinstance(value, int) and not isinstance(value, bool)  # Python itself refuses to print it
     return f"{what}: {'a huge integer' if huge else repr(value)[:40]} is not a finite number"
 
 
 def known_command(commands: Mapping[str, str], name: str) -> str:
-    """What it does. Raises UnknownName."""
+    """What the command does. Raises UnknownName, which lists the commands."""
     if name not in commands:
         raise UnknownName(f"no command {name!r}: there are {', '.join(f'{each} ({what})' for each, what in commands.items())}")
     return commands[name]

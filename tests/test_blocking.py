@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import runpy
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -119,13 +122,11 @@ def test_watching_and_events(tmp_path: Path) -> None:
         assert next(snapshots)["arm/s1"].position == 7
         snapshots.close()
         until(lambda: puppet.calls("unsubscribe"))
-        heard: list[str] = []
-        hearing = threading.Thread(target=lambda: heard.append(next(rig.events()).name))
-        hearing.start()
-        until(lambda: {"topic": "events"} in puppet.calls("subscribe"))
+        assert {"topic": "events"} in puppet.calls("subscribe")
+        events = rig.events()
         in_daemon(puppet, lambda: puppet.visitor.notify("events", name="estop", time=1.0, fields={}))
-        hearing.join(10)
-        assert heard == ["estop"]
+        assert next(events).name == "estop", "what happens between the call and `next` is not lost"
+        events.close()
         for _ in rig.watch(hz=5):
             break
 
@@ -177,9 +178,9 @@ def test_left_by_an_error(tmp_path: Path) -> None:
         assert puppet.calls("release") == []
 
 
-def fail(outcome: Outcome) -> None:
+def fail(outcome: Outcome, error: type[BaseException] = ZeroDivisionError) -> None:
     assert outcome is Outcome.ACKED
-    raise ZeroDivisionError
+    raise error
 
 
 def test_left_while_another_thread_waits(tmp_path: Path) -> None:
@@ -213,6 +214,56 @@ def test_ctrl_c_while_connecting(tmp_path: Path) -> None:
 def test_nobody_listens(tmp_path: Path) -> None:
     with pytest.raises(LinkDown, match="servobus run"):
         blocking.connect(tmp_path / "s")
+
+
+@pytest.mark.parametrize("call", ["connect", "open"])
+def test_a_failure_to_open_prints_one_traceback(call: str, tmp_path: Path) -> None:
+    code = f"from servobus import blocking; blocking.{call}({str(tmp_path / 'missing')!r})"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 1
+    assert process.stderr.count("Traceback") == 1, process.stderr
+    assert "missing" in process.stderr.splitlines()[-1]
+
+
+def test_ctrl_c_in_the_block_counts_as_a_loss(tmp_path: Path) -> None:
+    with daemon(tmp_path / "s") as puppet:
+        with pytest.raises(KeyboardInterrupt), blocking.connect(tmp_path / "s") as rig:
+            fail(rig["s1"].move_to(1), KeyboardInterrupt)
+        until(lambda: puppet.visitor.gone)
+        assert puppet.calls("release") == []
+
+
+def test_events_of_a_rig_of_its_own_begin_at_the_call() -> None:
+    with blocking.open(config()) as rig:
+        events = rig.events()
+        rig.stop()
+        rig.clear()
+        assert [next(events).name for _ in range(2)] == ["estop", "estop_cleared"]
+
+
+def test_a_rig_that_another_thread_waits_for_can_be_closed() -> None:
+    """A call without an end, on a rig of its own, ends with the rig."""
+    rig = blocking.open(config())
+    errors: list[Exception] = []
+
+    def wait() -> None:
+        try:
+            next(rig.events())
+        except LinkDown as error:
+            errors.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    rig.snapshot()
+    rig.close()
+    waiting.join(10)
+    assert len(errors) == 1
+
+
+def test_the_stub_is_what_the_script_writes() -> None:
+    script = runpy.run_path(str(Path(__file__).parent.parent / "scripts" / "stubs"))
+    text = script["stub"]((script["RIG"] / "interface.py").read_text())
+    assert (script["RIG"] / "blocking_verbs.pyi").read_text() == text, "run scripts/stubs"
 
 
 def test_a_callback_may_not_wait_for_its_own_thread(tmp_path: Path) -> None:

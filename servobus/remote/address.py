@@ -1,4 +1,4 @@
-"""How a client reaches a daemon: its address, the token, TLS, and what to tell a person when nobody is there."""
+"""The address of a daemon, its token, TLS, and the errors of a daemon that cannot be reached."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from servobus.errors import AccessDenied, ConfigError, LinkDown
-from servobus.remote.connection import Connection
+from servobus.remote.connection import DaemonConnection
 from servobus.rpc.socket_path import find_socket, socket_path
 
 CONNECT_TIMEOUT = 5.0
-"""Seconds until the connection stands, and again until the daemon has said who it is."""
+"""Seconds for the connection to open."""
 MAX_TOKEN = 4096
 
 
@@ -31,14 +31,14 @@ class Address:
     def __str__(self) -> str:
         return str(self.path) if self.path else f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
-    async def dial(self, wire: Callable[[], Connection]) -> Connection:
-        """A connection. Raises LinkDown, AccessDenied."""
+    async def open(self, make: Callable[[], DaemonConnection]) -> DaemonConnection:
+        """Open a connection. Raises LinkDown, AccessDenied."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 if self.path:
-                    return (await loop.create_unix_connection(wire, str(self.path)))[1]
-                return (await loop.create_connection(wire, self.host, self.port, ssl=self.tls))[1]
+                    return (await loop.create_unix_connection(make, str(self.path)))[1]
+                return (await loop.create_connection(make, self.host, self.port, ssl=self.tls))[1]
         except PermissionError:
             raise AccessDenied(f"{self}: this user may not open the socket: become a member of its group") from None
         except ssl.SSLError as error:
@@ -51,9 +51,9 @@ class Address:
             raise LinkDown(f"{self}: {error.strerror or error}: check the address, or start it: servobus run CONFIG") from None
 
 
-def address_of(place: str | Path | None, tls: bool | str | Path | ssl.SSLContext) -> Address:
-    """What a person writes. Raises ConfigError."""
-    text = str((find_socket() or socket_path()) if place is None else place)
+def address_of(address: str | Path | None, tls: bool | str | Path | ssl.SSLContext) -> Address:
+    """The address that a person wrote, or the usual one. Raises ConfigError."""
+    text = str((find_socket() or socket_path()) if address is None else address)
     if "://" not in text:
         if tls:
             raise ConfigError(f"{text}: a Unix socket has no TLS: leave `tls` away, or connect to tcp://host:port")
@@ -87,7 +87,7 @@ def _context(tls: bool | str | Path | ssl.SSLContext) -> ssl.SSLContext:
 
 
 def token_of(token: str | None, token_file: str | Path | None) -> str | None:
-    """Read anew at each connection, so that a token may change. Raises ConfigError."""
+    """The token; a file is read again at each connection, so that a token may change. Raises ConfigError."""
     if token is not None and token_file is not None:
         raise ConfigError("give a token or a token_file, not both")
     if token_file is None:

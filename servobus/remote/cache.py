@@ -1,4 +1,4 @@
-"""What a client keeps of a rig it is connected to: names, states, the e-stop, statistics. The time is given."""
+"""What a client keeps of the rig it is connected to: names, states, the e-stop, statistics. Pure: the time is given."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from servobus.values import Health, Snapshot, State
 
 
 def received(state: State, now: float) -> State:
-    """Its time on this machine, which may have another clock than the daemon's."""
+    """The state with its time on this machine, whose clock may differ from the daemon's."""
     return replace(state, time=None if state.age is None else now - state.age)
 
 
 class StateCache:
-    """Filled by every connection anew; `down` while there is none."""
+    """Filled again by each connection. `down` is set while there is none."""
 
     def __init__(self) -> None:
         self.names: dict[str, tuple[str, str]] = {}
@@ -26,12 +26,12 @@ class StateCache:
         self._states: Snapshot = {}
         self._stats: dict[str, Any] = {}
 
-    def know(self, states: Mapping[str, State]) -> None:
-        """What came last is the newest: a connection keeps the order."""
+    def put(self, states: Mapping[str, State]) -> None:
+        """What comes last is the newest: a connection keeps the order."""
         self._states = {**self._states, **states}
 
     def aged(self, states: Mapping[str, State], now: float) -> Snapshot:
-        """As they are now: older than when they came, and offline while there is no daemon to tell."""
+        """The states with their present age, and offline while there is no connection."""
         return {
             name: replace(
                 state,
@@ -45,30 +45,30 @@ class StateCache:
         nothing = State()
         return self.aged({name: self._states.get(name, nothing) for name in self.names}, now)
 
-    def counted(self, stats: dict[str, Any]) -> None:
+    def put_stats(self, stats: dict[str, Any]) -> None:
         self._stats = stats
 
     def stats(self) -> dict[str, Any]:
-        """Raises LinkDown: figures do not tell their age."""
+        """The last statistics. Raises LinkDown while there is no connection, because they have no age."""
         if self.down is not None:
             raise LinkDown(self.down.message)
         return self._stats
 
 
 class LatestSnapshot:
-    """A place for one snapshot: what was not fetched is replaced."""
+    """Holds one snapshot: a newer one replaces it."""
 
     def __init__(self) -> None:
         self._states: Snapshot | None = None
-        self._some = asyncio.Event()
+        self._changed = asyncio.Event()
 
     def put(self, states: Snapshot) -> None:
         self._states = states
-        self._some.set()
+        self._changed.set()
 
     async def get(self) -> Snapshot:
         while self._states is None:
-            self._some.clear()
-            await self._some.wait()
+            self._changed.clear()
+            await self._changed.wait()
         states, self._states = self._states, None
         return states

@@ -1,6 +1,7 @@
-"""One connection to a daemon: requests out, answers and notices in, one JSON object a line.
+"""One connection to a daemon: calls out, replies and notices in, one JSON object a line.
 
-The other end is not trusted: what is no answer ends the connection, a line has a greatest length, and every call a deadline.
+The other end is not trusted: a line that is neither reply nor notice ends the connection, lines have a maximum length, and every
+call has a deadline.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from servobus.errors import InvalidRequest, LimitError, LinkDown, Overloaded, Re
 from servobus.rpc.errors import decoded
 from servobus.rpc.methods import MAX_LINE, METHODS
 
-MAX_ANSWER = 4 * 1024 * 1024
+MAX_REPLY = 4 * 1024 * 1024
 """Bytes of one line from the daemon."""
 MAX_WAITING = 1024
-"""Calls of one connection that wait for their answers."""
+"""Calls of one connection that wait for their replies."""
 MAX_UNSENT = 1024 * 1024
 """Bytes that the daemon has not taken yet, above which nothing more is sent."""
 
 
 class _Message(msgspec.Struct):
-    """An answer (id, and result or error) or a notice (method and params)."""
+    """A reply (id, and result or error) or a notice (method and params)."""
 
     id: int | None = None
     method: str | None = None
@@ -36,17 +37,17 @@ class _Message(msgspec.Struct):
 
 
 @dataclass(slots=True)
-class _Call:
+class _PendingCall:
     method: str
-    answer: asyncio.Future[Any]
+    reply: asyncio.Future[Any]
     timeout: float
     overdue: asyncio.TimerHandle
     then: Callable[[Any], Any] | None
-    """Called with the result the moment it comes, before anything that follows it is read; its value is the answer."""
+    """Called with the result the moment it comes, before anything that follows it is read; its value is the reply."""
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of other classes (numpy) as JSON's own."""
+    """Numbers of other classes (numpy) as plain ones."""
     for kind in (float, int):
         if isinstance(value, kind):
             return kind(value)
@@ -62,35 +63,35 @@ def _result(method: str) -> Callable[[bytes], Any]:
     return msgspec.json.Decoder(METHODS[method].result).decode
 
 
-class Connection(asyncio.Protocol):
-    """`notice(method, params)` hears what comes unasked; `lost(wire, why)` is called once, when the connection is no more."""
+class DaemonConnection(asyncio.Protocol):
+    """`notice(method, params)` is called with each notice, `lost(connection, error)` once, when the connection has ended."""
 
     def __init__(
         self,
-        place: str,
+        address: str,
         notice: Callable[[str, msgspec.Raw], None],
-        lost: Callable[[Connection, LinkDown], None] = lambda *_: None,
+        lost: Callable[[DaemonConnection, LinkDown], None] = lambda *_: None,
     ) -> None:
-        self.place = place
+        self.address = address
         self.down: LinkDown | None = None
-        """Why the connection is no more."""
-        self.heard = 0.0
-        """When the last bytes came."""
+        """Why the connection has ended."""
+        self.received_at = 0.0
+        """Loop time of the last bytes."""
         self._notice = notice
         self._lost = lost
         self._loop = asyncio.get_running_loop()
-        self._calls: dict[int, _Call] = {}
-        self._asked = 0
+        self._calls: dict[int, _PendingCall] = {}
+        self._last_id = 0
         self._rest = bytearray()
 
     # Transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self.heard = self._loop.time()
+        self.received_at = self._loop.time()
 
     def data_received(self, data: bytes) -> None:
-        self.heard = self._loop.time()
+        self.received_at = self._loop.time()
         if b"\n" not in data:
             self._rest += data
         else:
@@ -99,14 +100,14 @@ class Connection(asyncio.Protocol):
             for line in lines:
                 if self.down is None:
                     self._line(line)
-        if len(self._rest) > MAX_ANSWER:
-            self._nonsense(self._rest, f"a line of more than {MAX_ANSWER} bytes")
+        if len(self._rest) > MAX_REPLY:
+            self._reject(self._rest, f"a line of more than {MAX_REPLY} bytes")
 
     def connection_lost(self, error: Exception | None) -> None:
         self.fail("the daemon has closed the connection" if error is None else f"the connection broke: {error}")
         self._lost(self, self.down or LinkDown("closed"))
 
-    # In
+    # Lines from the daemon
 
     def _line(self, line: bytes) -> None:
         try:
@@ -114,21 +115,21 @@ class Connection(asyncio.Protocol):
             if message.method is not None:
                 self._notice(message.method, message.params)
             elif message.id is None:
-                self._rejected(message.error)
-            elif not 0 < message.id <= self._asked:
-                raise ValueError(f"an answer to request {message.id}, which was never made")
-            elif message.id in self._calls:  # else it was given up, or is answered already
-                self._answered(message.id, message)
+                self._connection_error(message.error)
+            elif not 0 < message.id <= self._last_id:
+                raise ValueError(f"a reply to call {message.id}, which was never made")
+            elif message.id in self._calls:  # else its caller has left
+                self._finish(message.id, message)
         except (ValueError, KeyError, TypeError, RecursionError) as error:  # msgspec's own are ValueErrors
-            self._nonsense(line, str(error))
+            self._reject(line, str(error))
 
-    def _rejected(self, error: Any) -> None:
-        """An error that answers no request of ours is about the connection."""
+    def _connection_error(self, error: Any) -> None:
+        """An error without a call is about the connection."""
         if error is None:
-            raise ValueError("neither an answer nor a notice")
+            raise ValueError("neither a reply nor a notice")
         self.fail(f"the daemon ends the connection: {decoded(error)}")
 
-    def _answered(self, number: int, message: _Message) -> None:
+    def _finish(self, number: int, message: _Message) -> None:
         call = self._calls[number]
         if message.error is None:
             if not message.result:
@@ -136,27 +137,27 @@ class Connection(asyncio.Protocol):
             value = _result(call.method)(message.result)
             value = call.then(value) if call.then else value
         self._forget(number)
-        if call.answer.done():
+        if call.reply.done():
             return
         if message.error is None:
-            call.answer.set_result(value)
+            call.reply.set_result(value)
         else:
-            call.answer.set_exception(decoded(message.error))
+            call.reply.set_exception(decoded(message.error))
 
-    def _nonsense(self, line: bytes | bytearray, why: str) -> None:
+    def _reject(self, line: bytes | bytearray, why: str) -> None:
         self.fail(f"what answers there is no servobus daemon, or of another version: {why} in {bytes(line[:60])!r}")
 
-    # Out
+    # Calls
 
     async def call(self, method: str, params: dict[str, Any], *, timeout: float, then: Callable[[Any], Any] | None = None) -> Any:
-        """What the daemon answers. Raises what it says, LinkDown, and ReplyTimeout when it says nothing for `timeout` seconds."""
-        number, answer = self._ask(method, params, timeout, then)
+        """Call a method and return its result. Raises the error of the reply, LinkDown; ReplyTimeout after `timeout` seconds."""
+        number, reply = self._send(method, params, timeout, then)
         try:
-            return await answer
+            return await reply
         finally:
             self._forget(number)
 
-    def _ask(
+    def _send(
         self, method: str, params: dict[str, Any], timeout: float, then: Callable[[Any], Any] | None
     ) -> tuple[int, asyncio.Future[Any]]:
         if self.down is not None:
@@ -164,15 +165,15 @@ class Connection(asyncio.Protocol):
         full = len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT
         if full and method != "stop":
             raise Overloaded(f"{len(self._calls)} calls wait for the daemon already: ask for less, or later")
-        line = self._encoded({"jsonrpc": "2.0", "id": self._asked + 1, "method": method, "params": params})
-        self._asked = number = self._asked + 1
-        answer = self._loop.create_future()
-        self._calls[number] = _Call(method, answer, timeout, self._loop.call_later(timeout, self._overdue, number), then)
+        line = self._encoded({"jsonrpc": "2.0", "id": self._last_id + 1, "method": method, "params": params})
+        self._last_id = number = self._last_id + 1
+        reply = self._loop.create_future()
+        self._calls[number] = _PendingCall(method, reply, timeout, self._loop.call_later(timeout, self._overdue, number), then)
         self._transport.write(line)
-        return number, answer
+        return number, reply
 
-    def tell(self, method: str, params: dict[str, Any]) -> None:
-        """Without an answer."""
+    def notify(self, method: str, params: dict[str, Any]) -> None:
+        """Call a method without waiting for a reply."""
         if self.down is None:
             self._transport.write(self._encoded({"jsonrpc": "2.0", "method": method, "params": params}))
 
@@ -186,10 +187,10 @@ class Connection(asyncio.Protocol):
             raise InvalidRequest(f"this call is {len(line)} bytes long, the daemon takes {MAX_LINE}: split it; nothing was sent")
         return line
 
-    # Ends
+    # Time-outs and the end
 
-    def still(self, method: str) -> None:
-        """The daemon is at it: those calls get their full time again."""
+    def extend(self, method: str) -> None:
+        """The daemon is working on calls of this method: their time-out begins again."""
         for number, call in self._calls.items():
             if call.method == method:
                 call.overdue.cancel()
@@ -197,8 +198,8 @@ class Connection(asyncio.Protocol):
 
     def _overdue(self, number: int) -> None:
         call = self._calls[number]
-        if not call.answer.done():
-            call.answer.set_exception(
+        if not call.reply.done():
+            call.reply.set_exception(
                 ReplyTimeout(f"the daemon did not answer {call.method} within {call.timeout:g} s: it may have been applied")
             )
 
@@ -208,17 +209,17 @@ class Connection(asyncio.Protocol):
             call.overdue.cancel()
 
     def fail(self, why: str) -> None:
-        """Give the connection up at once."""
+        """End the connection at once; what waits fails."""
         if self.down is not None:
             return
-        self.down = LinkDown(f"{self.place}: {why}")
+        self.down = LinkDown(f"{self.address}: {why}")
         for call in self._calls.values():
-            if not call.answer.done():
-                call.answer.set_exception(LinkDown(f"{self.down.message}; {call.method} was under way and may have been applied"))
+            if not call.reply.done():
+                call.reply.set_exception(LinkDown(f"{self.down.message}; {call.method} was under way and may have been applied"))
         self._transport.abort()
 
     def close(self) -> None:
-        """Once what was said has gone out."""
+        """End the connection once everything is sent."""
         if self.down is None:
-            self.down = LinkDown(f"{self.place}: this client has left")
+            self.down = LinkDown(f"{self.address}: this client has left")
             self._transport.close()

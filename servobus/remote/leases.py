@@ -1,4 +1,4 @@
-"""A client's side of the motion leases: taken by moving, renewed while anything is held, acquired anew for a fresh wish."""
+"""A client's side of the motion leases: taken by moving, renewed while any is held, acquired again after a loss."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import Any
 
 from servobus.errors import LeaseHeld, LinkDown, ReplyTimeout, ServobusError
-from servobus.remote.claims import HeldLeases
+from servobus.remote.held_leases import HeldLeases
 from servobus.remote.session import Session
 
 RELEASE_TIMEOUT = 1.0
@@ -16,7 +16,7 @@ RELEASE_TIMEOUT = 1.0
 
 
 class ClientLeases:
-    """Servos by full name."""
+    """The leases of one client. Servos by full name."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -27,16 +27,16 @@ class ClientLeases:
         self._renewing: asyncio.Task[None] | None = None
 
     def begin(self, ttl: float) -> None:
-        """With a new connection."""
+        """A new connection: `ttl` is how long its leases last, in seconds."""
         self._held.clear()
         self._held.ttl = ttl
 
     async def move(
         self, method: str, servos: Collection[str], params: dict[str, Any], then: Callable[[Any], Any] | None = None
     ) -> Any:
-        """A wish of this moment: what was lost since the last one is acquired for it in so many words."""
-        if anew := self._held.to_acquire(servos, self._clock()):
-            await self.acquire(anew)
+        """Call a method that moves. Leases that were lost since the last motion are acquired first."""
+        if lost := self._held.to_acquire(servos, self._clock()):
+            await self.acquire(lost)
         self._renew_from_now()
         self._moving += 1
         asked = self._clock()
@@ -65,7 +65,7 @@ class ClientLeases:
             self._renewing = asyncio.create_task(self._renew())
 
     async def _renew(self) -> None:
-        """Three times in a lease, as long as anything is held or about to be."""
+        """Renew three times within the life of a lease, as long as one is held or a motion is under way."""
         while True:
             await asyncio.sleep(self._held.ttl / 3)
             asked = self._clock()
@@ -80,10 +80,10 @@ class ClientLeases:
                 return
 
     async def end(self, *, lost: bool) -> None:
-        """Give all of it back, unless this client is `lost`."""
+        """Give all leases back, unless this client is `lost`."""
         if self._renewing is None:
             return
         self._renewing.cancel()
         if not lost:
-            with suppress(LinkDown, ReplyTimeout):  # there is nobody left to give it back to
+            with suppress(LinkDown, ReplyTimeout):  # the daemon is gone, and the leases with it
                 await self._session.call("release", {}, timeout=RELEASE_TIMEOUT)

@@ -1,29 +1,38 @@
 """RemoteRig: the rig of a running daemon. A program cannot tell it from one whose ports it owns itself.
 
-Motion needs its servos' leases, which it takes and keeps by itself (`holding.py`). After a verb that enables, disables or stops,
-`snapshot` and `stopped` are as that verb has left them.
+What needs no turn (`names`, `stopped`, `snapshot`, `stats`) is answered from what the daemon sends by itself: states `refresh_hz`
+times a second, statistics once a second. Most verbs are calls of the daemon, made by `_forward` from the table in `rig/verbs.py`;
+written out here are those for which a client does more. Motion needs the leases of its servos, which `leases.py` takes and keeps.
 """
 
 from __future__ import annotations
 
+import abc
 import asyncio
+import functools
 import ssl
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
-from servobus.errors import InvalidRequest, LimitError, ServobusError
+import msgspec
+
+from servobus.errors import InvalidRequest, LimitError, LinkDown, ServobusError
 from servobus.remote.address import address_of, token_of
-from servobus.remote.listener import Listening
-from servobus.remote.session import DEADLINE
-from servobus.rpc.methods import MAX_HZ, MIN_HZ
+from servobus.remote.cache import LatestSnapshot, StateCache, received
+from servobus.remote.connection import DaemonConnection
+from servobus.remote.leases import ClientLeases
+from servobus.remote.session import Opener, Session
+from servobus.rig.events import Event, EventSource, EventStream
+from servobus.rig.interface import Rig
+from servobus.rig.verbs import DEADLINE, VERBS, Verb, arguments
+from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
 from servobus.values import (
     GOAL_NUMBERS,
-    Change,
+    EventName,
     Goal,
-    Identity,
     Outcome,
     Reload,
     ScanHit,
@@ -36,11 +45,16 @@ from servobus.values import (
 
 T = TypeVar("T")
 FOREVER = 1e9
+"""Seconds in place of an infinity, which JSON does not have."""
+MIN_LEASE = 0.1
+"""Seconds: no daemon makes this client renew more often than this asks for."""
+REFRESH_TIMEOUT = 1.0
+"""Seconds that a verb which is done waits for the states that it changed."""
 
 
 @asynccontextmanager
 async def connect(
-    place: str | Path | None = None,
+    address: str | Path | None = None,
     *,
     name: str = "",
     token: str | None = None,
@@ -48,14 +62,25 @@ async def connect(
     tls: bool | str | Path | ssl.SSLContext = False,
     refresh_hz: float = 10.0,
 ) -> AsyncIterator[RemoteRig]:
-    """The rig of the daemon at `place`: the path of its socket (none: the usual one), or tcp://host:port with its token. `name`:
-    what others read when this client holds a servo. `tls`: True, the PEM file that signs the daemon's certificate, or a context.
-    Left normally, motion goes on to its end; left by an exception, the servos moved from here do their `on_lost_client`.
-    Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
+    """Connect to a running daemon until the context ends.
+
+    Left normally, motion goes on to its end. Left by an exception, the servos moved from here do their `on_lost_client`.
+
+    Args:
+        address: Path of the daemon's socket, or tcp://host:port; None: SERVOBUS_SOCKET or the usual place.
+        name: What other clients read when this one holds a servo.
+        token: The token of a TCP daemon.
+        token_file: The file that holds it; it is read again for each connection.
+        tls: True, the PEM file that signs the daemon's certificate, or an SSL context.
+        refresh_hz: How often the daemon sends states for `snapshot`, 0.1 to 200 times a second.
+
+    Returns: A context manager whose value is a RemoteRig.
+    Raises: LinkDown, AccessDenied, NotSupported, ConfigError.
+    """
     if not MIN_HZ <= refresh_hz <= MAX_HZ:
         raise ValueError(f"connect: refresh_hz {refresh_hz} is outside {MIN_HZ:g} to {MAX_HZ:g}")
-    address = address_of(place, tls)
-    rig = RemoteRig(str(address), address.dial, lambda: {"client": name, "token": token_of(token, token_file)}, refresh_hz)
+    where = address_of(address, tls)
+    rig = RemoteRig.make(str(where), where.open, lambda: {"client": name, "token": token_of(token, token_file)}, refresh_hz)
     try:
         await rig.start()
         yield rig
@@ -65,36 +90,215 @@ async def connect(
     await rig.leave(lost=False)
 
 
-class RemoteRig(Listening):
-    """Made by `servobus.connect`, and alive as long as that context. It connects anew by itself; a call while there is no
-    connection raises LinkDown at once, and none is ever repeated."""
+def _forward(verb: Verb) -> Callable[..., Coroutine[Any, Any, Any]]:
+    """The verb as a call of the daemon."""
 
-    # Motion
+    @functools.wraps(verb.function)
+    async def call(self: RemoteRig, *args: Any, **kwargs: Any) -> Any:
+        params = arguments(verb, args, kwargs)
+        if "names" in params:
+            params["names"] = self.full_names(params["names"])
+        elif next(iter(params), "") == "name":
+            params["name"] = self.full_name(params["name"])
+        return await self._call(verb.name, params)
+
+    vars(call).pop("__isabstractmethod__", None)  # `wraps` copies it
+    return call
+
+
+def _with_all_verbs(rig: type[T]) -> type[T]:
+    """Add the verbs that are still abstract."""
+    abstract: frozenset[str] = getattr(rig, "__abstractmethods__", frozenset())
+    for name in abstract & VERBS.keys():
+        setattr(rig, name, _forward(VERBS[name]))
+    return abc.update_abstractmethods(rig)
+
+
+@_with_all_verbs
+class RemoteRig(Rig):
+    """Made by `servobus.connect`, and in use as long as that context.
+
+    It connects again by itself. A call while there is no connection raises LinkDown at once; no call is ever repeated. After a
+    verb that enables, disables or stops, `snapshot` and `stopped` are as that verb left them.
+    """
+
+    def __init__(self, address: str, opener: Opener, hello: Callable[[], dict[str, Any]], refresh_hz: float) -> None:
+        self.greeting: Greeting | None = None
+        """What the daemon said of itself last."""
+        self._cache = StateCache()
+        self._event_source = EventSource()
+        self._session = Session(address, opener, hello, self._greeted, self._fill_cache, self._changed, self._progressed)
+        self._leases = ClientLeases(self._session)
+        self._refresh_hz = refresh_hz
+        self._clock = asyncio.get_running_loop().time
+        self._renaming: asyncio.Task[None] | None = None
+        self._scans: dict[str, Callable[[int, int, ScanHit | None], None]] = {}
+        self._watches: set[LatestSnapshot] = set()
+
+    @classmethod
+    def make(cls, address: str, opener: Opener, hello: Callable[[], dict[str, Any]], refresh_hz: float) -> Self:
+        """A rig that is not connected yet."""
+        return cls(address, opener, hello, refresh_hz)
+
+    # Connection
+
+    async def start(self) -> None:
+        """Connect for the first time. Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
+        self._session.keep_subscribed({"topic": "state", "hz": self._refresh_hz}, self._states_came)
+        self._session.keep_subscribed({"topic": "stats", "hz": 1.0}, lambda params: self._cache.put_stats(params["stats"]))
+        self._session.keep_subscribed({"topic": "events"}, self._event_came)
+        await self._session.connect()
+
+    def _greeted(self, greeting: Greeting) -> None:
+        self.greeting = greeting
+        self._leases.begin(max(greeting.lease_ms / 1000, MIN_LEASE))
+        self._cache.names, self._cache.stopped = greeting.names, greeting.stopped
+
+    async def _fill_cache(self, connection: DaemonConnection) -> None:
+        """Before a new connection is used: what `snapshot` and `stats` return."""
+        await asyncio.gather(
+            connection.call("snapshot", {}, timeout=DEADLINE, then=self._store),
+            connection.call("stats", {}, timeout=DEADLINE, then=self._cache.put_stats),
+        )
+
+    def _changed(self, lost: LinkDown | None) -> None:
+        """The connection is up (None), or is lost for this reason."""
+        before, self._cache.down = self._cache.down, lost
+        if lost is not None:
+            for latest in self._watches:
+                latest.put(self._cache.snapshot(self._clock()))
+            self._event_source.publish(Event(EventName.DAEMON_LOST, self._clock(), {"reason": lost.message}))
+        elif before is not None:
+            self._event_source.publish(Event(EventName.DAEMON_BACK, self._clock()))
+
+    async def leave(self, *, lost: bool) -> None:
+        """Close the connection. `lost`: leases are not given back, as if this process had been killed."""
+        if self._renaming is not None:
+            self._renaming.cancel()
+        try:
+            await self._leases.end(lost=lost)
+        finally:
+            await self._session.close(lost=lost)
+
+    async def call(self, method: str, **params: Any) -> Any:
+        """Call a `method` of the daemon that is no verb of a rig (`health`, `config`, `leases`) with these `params`."""
+        return await self._session.call(method, params)
+
+    async def _call(self, method: str, params: dict[str, Any], then: Callable[[Any], Any] | None = None) -> Any:
+        """Call a verb. One that changes states reads them again afterwards, also when it failed for some servos."""
+        refresh = self._refresh if VERBS[method].refreshes else _nothing
+        try:
+            result = await self._session.call(method, params, then=then)
+        except ServobusError:
+            await refresh()
+            raise
+        await refresh()
+        return result
+
+    # What is known without a turn
+
+    @property
+    def names(self) -> Mapping[str, tuple[str, str]]:
+        return self._cache.names
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the e-stop was latched when the daemon last said so."""
+        return self._cache.stopped
+
+    def snapshot(self) -> Snapshot:
+        """Not older than `refresh_hz` allows. While there is no connection: the last states, with their age, and offline."""
+        return self._cache.snapshot(self._clock())
+
+    def stats(self) -> dict[str, Any]:
+        """As `Rig.stats`, about a second old at most. Raises LinkDown while there is no connection."""
+        return self._cache.stats()
+
+    def _store(self, states: Snapshot) -> Snapshot:
+        """Store states the moment they come, so that they replace nothing newer."""
+        now = self._clock()
+        states = {name: received(state, now) for name, state in states.items()}
+        self._cache.put(states)
+        return states
+
+    def _states_came(self, params: dict[str, Any]) -> Snapshot:
+        states = self._store(msgspec.convert(params["states"], Snapshot))
+        self._cache.stopped = bool(params["stopped"])
+        if states.keys() != self._cache.names.keys() and (self._renaming is None or self._renaming.done()):
+            self._renaming = asyncio.create_task(self._rename())  # the daemon read its config again
+        return states
+
+    def _event_came(self, params: dict[str, Any]) -> None:
+        event = Event(str(params["name"]), self._clock(), dict(params.get("fields", {})), int(params.get("missed", 0)))
+        self._event_source.publish(event)
+
+    def _progressed(self, params: dict[str, Any]) -> None:
+        progress, hit = self._scans.get(params["bus"]), params.get("found")
+        if progress is not None:
+            progress(params["asked"], params["count"], None if hit is None else msgspec.convert(hit, ScanHit))
+
+    async def _rename(self) -> None:
+        with suppress(ServobusError):  # the next notice asks again
+            self._cache.names = await self._session.call("names", {})
+
+    async def _refresh(self) -> None:
+        with suppress(ServobusError):  # the verb itself is done
+            await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._store)
+
+    async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
+        """As `Rig.watch`, with `hz` up to 200. When the connection is lost, a snapshot shows every servo offline."""
+        if not MIN_HZ <= hz <= 1000:
+            async for snapshot in super().watch(hz):
+                yield snapshot
+        latest = LatestSnapshot()
+        subscription = await self._session.subscribe(
+            {"topic": "state", "hz": min(hz, MAX_HZ)}, lambda params: latest.put(self._states_came(params))
+        )
+        self._watches.add(latest)
+        try:
+            yield self.snapshot()
+            while True:
+                yield self._cache.aged(await latest.get(), self._clock())
+        finally:
+            self._watches.discard(latest)
+            self._session.unsubscribe(subscription)
+
+    def events(self) -> EventStream:
+        """As `Rig.events`, with `daemon_lost` and `daemon_back`: between these two, events may have been lost. An event
+        has the time of its arrival here."""
+        return self._event_source.stream()
+
+    # Verbs with something of their own
 
     async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
-        full: dict[str, Goal] = {}
+        checked: dict[str, Goal] = {}
         for name, goal in goals.items():
-            if (whole := self.full_name(name)) in full:
-                raise InvalidRequest(f"{whole} is named twice: give it one goal; nothing was sent")
-            full[whole] = self._checked(whole, goal)
-        if not full:
+            if (full := self.full_name(name)) in checked:
+                raise InvalidRequest(f"{full} is named twice: give it one goal; nothing was sent")
+            checked[full] = self._checked(full, goal)
+        if not checked:
             return {}
-        params = {"goals": {name: asdict(goal) for name, goal in full.items()}, "together": together, "confirm": confirm}
-        outcomes: dict[str, Outcome] = await self._leases.move("send_all", full, params, lambda told: _about(full, told))
+        params = {"goals": {name: asdict(goal) for name, goal in checked.items()}, "together": together, "confirm": confirm}
+        outcomes: dict[str, Outcome] = await self._leases.move(
+            "send_all", checked, params, lambda outcomes: _exactly(checked, outcomes)
+        )
         return outcomes
 
     def _checked(self, name: str, goal: Goal) -> Goal:
-        """JSON has no word for what is no number, so that is refused here."""
+        """The goal with plain numbers. What is not a finite number is refused here, because JSON cannot carry it."""
         numbers: dict[str, Any] = {}
         for field in GOAL_NUMBERS:
             value = getattr(goal, field)
             if value is None and field != "value":
                 continue
-            if not is_number(value):
-                bus, servo = self.names[name]
-                raise LimitError(no_number(field, value), bus=bus, servo=servo)
+            self._require_number(name, field, value)
             numbers[field] = float(value)
         return replace(goal, **numbers)
+
+    def _require_number(self, name: str, what: str, value: Any) -> None:
+        if not is_number(value):
+            bus, servo = self.names[name]
+            raise LimitError(no_number(what, value), bus=bus, servo=servo)
 
     async def acquire(self, *names: str) -> None:
         await self._leases.acquire(self.full_names(names))
@@ -102,74 +306,39 @@ class RemoteRig(Listening):
     async def release(self, *names: str) -> None:
         await self._leases.release(self.full_names(names))
 
-    async def enable(self, *names: str) -> None:
-        await self._do("enable", {"names": self.full_names(names)})
-
-    async def disable(self, *names: str) -> None:
-        await self._do("disable", {"names": self.full_names(names)})
-
     async def stop(self) -> dict[str, StopReport]:
         def latched(reports: dict[str, StopReport]) -> dict[str, StopReport]:
             self._cache.stopped = True
             return reports
 
-        reports: dict[str, StopReport] = await self._do("stop", {}, then=latched)
+        reports: dict[str, StopReport] = await self._call("stop", {}, latched)
         return reports
 
     async def clear(self) -> None:
         def released(_: None) -> None:
             self._cache.stopped = False
 
-        await self._do("clear", {}, then=released)
-
-    async def _do(self, method: str, params: dict[str, Any], then: Callable[[Any], Any] | None = None) -> Any:
-        """A verb after which `snapshot` is to be as it has left the servos, even when it failed for some."""
-        try:
-            result = await self._session.call(method, params, then=then)
-        except ServobusError:
-            await self._refresh()
-            raise
-        await self._refresh()
-        return result
+        await self._call("clear", {}, released)
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
-        full, near = self.full_names(names), None if tolerance is None else _bounded(tolerance)
-        params = {"names": full, "tolerance": near, "timeout": _bounded(timeout)}
-
-        def learnt(states: Snapshot) -> Snapshot:
-            return self._learnt(_about(full, states))
-
-        settled: Snapshot = await self._session.call("settle", params, timeout=_bounded(timeout) + DEADLINE, then=learnt)
-        return settled
-
-    # One servo
+        full = self.full_names(names)
+        params = {"names": full, "tolerance": _bounded(tolerance), "timeout": min(timeout, FOREVER)}
+        states: Snapshot = await self._session.call(
+            "settle", params, timeout=min(timeout, FOREVER) + DEADLINE, then=lambda states: self._store(_exactly(full, states))
+        )
+        return states
 
     async def read(self, name: str, *, max_age: float | None = None) -> State:
         full = self.full_name(name)
-        params = {"name": full, "max_age": None if max_age is None else _bounded(max_age)}
-        state: State = await self._session.call("read", params, then=lambda state: self._learnt({full: state})[full])
+        params = {"name": full, "max_age": _bounded(max_age)}
+        state: State = await self._session.call("read", params, then=lambda state: self._store({full: state})[full])
         return state
-
-    async def read_register(self, name: str, register: str, *, raw: bool = False) -> Any:
-        return await self._session.call("read_register", {"name": self.full_name(name), "register": register, "raw": raw})
 
     async def write_register(self, name: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
         full = self.full_name(name)
-        if not is_number(value):
-            bus, servo = self.names[full]
-            raise LimitError(no_number(f"register {register}", value), bus=bus, servo=servo)
+        self._require_number(full, f"register {register}", value)
         params = {"name": full, "register": register, "value": value, "raw": raw, "persist": persist}
-        return await self._session.call("write_register", params)
-
-    async def ping(self, name: str) -> int | None:
-        health: int | None = await self._session.call("ping", {"name": self.full_name(name)})
-        return health
-
-    async def identify(self, name: str) -> Identity:
-        identity: Identity = await self._session.call("identify", {"name": self.full_name(name)})
-        return identity
-
-    # A bus, and all
+        return await self._call("write_register", params)
 
     async def scan(
         self,
@@ -179,42 +348,29 @@ class RemoteRig(Listening):
         ids: Iterable[int] = (),
         progress: Callable[[int, int, ScanHit | None], None] | None = None,
     ) -> list[ScanHit]:
-        """As `Rig.scan`; one that its caller leaves goes on to its end at the daemon."""
+        """As `Rig.scan` (`bus`, `baudrates`, `ids`, `progress`). When the caller is cancelled, the daemon goes on with it."""
         params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
         call = asyncio.ensure_future(self._session.call("scan", params))
-        failed: list[Exception] = []
+        failures: list[Exception] = []
 
-        def report(asked: int, count: int, found: ScanHit | None) -> None:
+        def report(asked: int, count: int, hit: ScanHit | None) -> None:
             try:
-                if progress is not None and not failed:
-                    progress(asked, count, found)
+                if progress is not None and not failures:
+                    progress(asked, count, hit)
             except Exception as error:  # noqa: BLE001 - the caller's own, and raised there
-                failed.append(error)
+                failures.append(error)
                 call.cancel()
 
-        self._scanning[bus] = report
+        self._scans[bus] = report
         try:
-            found: list[ScanHit] = await call
+            hits: list[ScanHit] = await call
         except asyncio.CancelledError:
-            if failed:
-                raise failed[0] from None
+            if failures:
+                raise failures[0] from None
             raise
         finally:
-            self._scanning.pop(bus, None)
-        return found
-
-    async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
-        change: Change = await self._session.call("set_id", {"bus": bus, "node": node, "new": new, "save": save})
-        return change
-
-    async def set_baudrate(self, bus: str, node: int, baudrate: int, *, save: bool = False) -> Change:
-        params = {"bus": bus, "node": node, "baudrate": baudrate, "save": save}
-        change: Change = await self._session.call("set_baudrate", params)
-        return change
-
-    async def command(self, bus: str, node: int, name: str, value: int | None = None) -> tuple[str, ...]:
-        told: tuple[str, ...] = await self._session.call("command", {"bus": bus, "node": node, "name": name, "value": value})
-        return told
+            self._scans.pop(bus, None)
+        return hits
 
     async def reload(self) -> Reload:
         report: Reload = await self._session.call("reload", {})
@@ -223,13 +379,16 @@ class RemoteRig(Listening):
         return report
 
 
-def _about(names: Collection[str], told: dict[str, T]) -> dict[str, T]:
-    """An answer about other servos is none."""
-    if told.keys() != set(names):
-        raise ValueError(f"an answer about {', '.join(told) or 'nothing'}, not about {', '.join(names)}")
-    return told
+async def _nothing() -> None:
+    """Nothing to do."""
 
 
-def _bounded(seconds: float) -> float:
-    """JSON has no infinity."""
-    return seconds if seconds < FOREVER else FOREVER
+def _exactly(names: Collection[str], results: dict[str, T]) -> dict[str, T]:
+    """Refuse a reply that is about other servos."""
+    if results.keys() != set(names):
+        raise ValueError(f"a reply about {', '.join(results) or 'nothing'}, not about {', '.join(names)}")
+    return results
+
+
+def _bounded(seconds: float | None) -> float | None:
+    return None if seconds is None else min(seconds, FOREVER)

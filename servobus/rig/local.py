@@ -227,12 +227,12 @@ class LocalRig(Rig):
         return await bus.read(servo, max_age)
 
     def state(self, name: str) -> State:
-        """The last known state of a servo, without a turn."""
+        """The last known state of the servo `name`, without a turn."""
         bus, servo = self.bus_of(name)
         return bus.state(servo)
 
     def recent(self, name: str, max_age: float) -> State | None:
-        """The state that `read` would return without a turn; None: it needs one."""
+        """The state of `name` that is at most `max_age` seconds old; None: `read` needs a turn."""
         bus, servo = self.bus_of(name)
         return bus.state(servo) if bus.is_fresh(servo, max_age) else None
 

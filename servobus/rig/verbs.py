@@ -129,7 +129,9 @@ def _message_type(kind: Any, *, goal: bool) -> Any:
 
 def arguments(verb: Verb, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of a message for a call of the verb. Raises TypeError where the call does not fit the signature."""
-    return dict(signature(verb).bind(*args, **kwargs).arguments)
+    bound = signature(verb).bind(*args, **kwargs)
+    bound.apply_defaults()
+    return bound.arguments
 
 
 def caller(verb: Verb) -> Callable[[Rig, Any], Coroutine[Any, Any, Any]]:

@@ -114,7 +114,7 @@ class Method:
     """Seconds a client waits for the reply; `scan` from one `progress` notice to the next."""
 
 
-def _method(verb: Verb) -> Method:
+def method_of(verb: Verb) -> Method:
     """A verb as a method: a message with the fields of its signature."""
     title = "".join(part.capitalize() for part in verb.name.split("_"))
     doc = {"__doc__": verb.function.__doc__}
@@ -134,7 +134,7 @@ METHODS: dict[str, Method] = {
     "leases": Method(Nothing, dict[str, str], Role.OBSERVER),
     "subscribe": Method(Subscribe, int, Role.OBSERVER),
     "unsubscribe": Method(Unsubscribe, None, Role.OBSERVER),
-    **{verb.name: _method(verb) for verb in VERBS.values() if verb.door},
+    **{verb.name: method_of(verb) for verb in VERBS.values() if verb.door},
     "acquire": Method(Names, LeaseGrant, Role.OPERATOR),
     "renew": Method(Nothing, LeaseGrant, Role.OPERATOR),
 }

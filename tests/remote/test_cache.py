@@ -20,24 +20,24 @@ def test_times_are_of_this_machine() -> None:
 
 
 def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
-    mirror = StateCache()
-    mirror.names = NAMES
-    mirror.know({"arm/b": State(position=1.0, time=99.0, age=0.1, health=Health.ONLINE), "arm/gone": State()})
-    assert mirror.snapshot(102.0) == {"arm/a": State(), "arm/b": State(position=1.0, time=99.0, age=3.0, health=Health.ONLINE)}
-    mirror.know({"arm/b": State(position=2.0, time=103.0)})
-    assert mirror.snapshot(102.0)["arm/b"] == State(position=2.0, time=103.0, age=0.0)
+    cache = StateCache()
+    cache.names = NAMES
+    cache.put({"arm/b": State(position=1.0, time=99.0, age=0.1, health=Health.ONLINE), "arm/gone": State()})
+    assert cache.snapshot(102.0) == {"arm/a": State(), "arm/b": State(position=1.0, time=99.0, age=3.0, health=Health.ONLINE)}
+    cache.put({"arm/b": State(position=2.0, time=103.0)})
+    assert cache.snapshot(102.0)["arm/b"] == State(position=2.0, time=103.0, age=0.0)
 
 
 def test_without_a_daemon_everything_is_offline_and_figures_are_none() -> None:
-    mirror = StateCache()
-    mirror.names = NAMES
-    mirror.know({"arm/b": State(position=1.0, time=99.0, health=Health.ONLINE)})
-    mirror.counted({"arm": {}})
-    assert mirror.stats() == {"arm": {}}
-    mirror.down = LinkDown("away")
-    assert [state.health for state in mirror.snapshot(100.0).values()] == ["offline", "offline"]
+    cache = StateCache()
+    cache.names = NAMES
+    cache.put({"arm/b": State(position=1.0, time=99.0, health=Health.ONLINE)})
+    cache.put_stats({"arm": {}})
+    assert cache.stats() == {"arm": {}}
+    cache.down = LinkDown("away")
+    assert [state.health for state in cache.snapshot(100.0).values()] == ["offline", "offline"]
     with pytest.raises(LinkDown, match="away"):
-        mirror.stats()
+        cache.stats()
 
 
 async def test_the_newest_replaces_what_was_not_fetched() -> None:

@@ -21,7 +21,7 @@ from servobus.errors import (
     ReplyTimeout,
     UnknownName,
 )
-from servobus.remote.connection import MAX_ANSWER, MAX_WAITING
+from servobus.remote.connection import MAX_REPLY, MAX_WAITING
 from servobus.remote.rig import connect
 from servobus.remote.session import SILENCE
 from servobus.rpc.methods import MAX_LINE
@@ -114,7 +114,7 @@ async def test_another_protocol(tmp_path: Path) -> None:
         b'{"jsonrpc":"2.0","id":1,"error":{"code":1e400}}\n',
         b"[" * 100_000 + b"\n",
         b"\x00\xff\xfe\n",
-        b"x" * (MAX_ANSWER + 1),
+        b"x" * (MAX_REPLY + 1),
         b"",
     ],
 )
