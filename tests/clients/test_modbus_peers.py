@@ -47,7 +47,7 @@ def mbpoll(port: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed (Debian: apt-get install mbpoll)")
 def test_mbpoll(port: str) -> None:
-    """Reads, writes one and several registers, and is told what it may not."""
+    """mbpoll reads and writes registers, and its impossible requests are refused."""
     assert "[1000]: \t512" in mbpoll(port, "-r", "1000", port).stdout
     assert mbpoll(port, "-r", str(SPEED), port, "40000").returncode == 0
     assert mbpoll(port, "-r", "1185", port, "20", "21", "22").returncode == 0
@@ -75,7 +75,7 @@ def test_pymodbus_is_served(port: str) -> None:
 
 @asynccontextmanager
 async def pymodbus_hand() -> AsyncIterator[int]:
-    """Unit 2 with 2 000 registers, of which the first ones tell the map v2. Yields its port."""
+    """Unit 2 with 2 000 registers, whose first ones are those of the map v2. Yields its port."""
     registers = [0] * 2000
     registers[1000:1004] = [0x0200, 0x0301, 7, 0x2001]
     device = SimDevice(2, simdata=[SimData(0, values=registers, datatype=DataType.REGISTERS)])

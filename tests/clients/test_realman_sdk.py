@@ -1,4 +1,4 @@
-"""The arm vendor's own client against `servobus sim`; its wheel has a library for Linux on x86-64 that is known to work."""
+"""The arm vendor's own client against `servobus sim`; its wheel has a library for Linux on x86-64."""
 
 from __future__ import annotations
 

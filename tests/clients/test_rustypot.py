@@ -29,7 +29,7 @@ def client(tmp_path: Path) -> Iterator[rustypot.Sts3215PyController]:
 
 
 def test_it_sees_who_is_there(client: rustypot.Sts3215PyController) -> None:
-    """By ping, by model number, and by asking everybody at once."""
+    """By ping, by model number, and by a broadcast scan."""
     assert all(client.ping(node) for node in IDS)
     assert [client.read_register(node, "model") for node in IDS] == [STS3215] * 3
     assert client.broadcast_scan() == dict.fromkeys(IDS, STS3215)

@@ -115,7 +115,7 @@ def test_sync_write_moves_several(client: Client) -> None:
 
 
 def test_reg_write_waits_for_action(client: Client) -> None:
-    """The SDK's calls for it; ACTION goes to everybody."""
+    """The SDK's calls for it; ACTION is a broadcast."""
     assert client.packets.regWriteTxRx(client.port, 1, GOAL_POSITION, 2, [0x40, 0x08]) == (scservo_sdk.COMM_SUCCESS, 0)
     before = client.read(1, PRESENT_POSITION, 2)
     assert client.packets.action(client.port, scservo_sdk.BROADCAST_ID) == scservo_sdk.COMM_SUCCESS
@@ -136,7 +136,7 @@ def test_an_id_can_be_set_and_set_back(client: Client) -> None:
 
 
 def port_is_clear(client: Client) -> None:
-    """The six bytes of a reply that nobody waited for."""
+    """The six bytes of a reply that was not waited for."""
     client.port.setPacketTimeout(6)
     reply, result = client.packets.rxPacket(client.port)
     assert (result, len(reply)) == (scservo_sdk.COMM_SUCCESS, 6)

@@ -1,4 +1,4 @@
-"""A bare PTY: the test holds the far side in its hands."""
+"""A bare PTY whose far side is driven by the test."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Pty:
         assert select.select([self.slave], [], [], PATIENCE)[0]
 
     async def receive(self, size: int) -> bytes:
-        """So many bytes."""
+        """Return this many bytes."""
         received = b""
         while len(received) < size:
             await self._readable()
@@ -37,7 +37,7 @@ class Pty:
         return received
 
     def received(self) -> bytes:
-        """What has come and was not heard yet."""
+        """Return what has arrived and was not read yet."""
         try:
             return os.read(self._master, 100_000)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""What the link tests listen with, and the loops they run on."""
+"""A protocol that records what a link delivers, and the event loops on which link tests run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def on_each_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[str
 
 
 class Receiver(asyncio.Protocol):
-    """Keeps what it is told, in order."""
+    """Records what a link reports, in order."""
 
     def __init__(self) -> None:
         self.pieces: list[bytes] = []
@@ -52,12 +52,12 @@ class Receiver(asyncio.Protocol):
         self._news.set()
 
     async def until(self, size: int) -> bytes:
-        """What was heard, when it is that many bytes."""
+        """Return what was received, once it has this many bytes."""
         await self._until(lambda: len(self.received) >= size)
         return self.received
 
     async def gone(self) -> Exception | None:
-        """With what the line was lost; and that it was lost once."""
+        """Return the reason of connection_lost, which must be called once."""
         await self._until(lambda: bool(self.lost))
         for _ in range(5):
             await asyncio.sleep(0)

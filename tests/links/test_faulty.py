@@ -1,4 +1,4 @@
-"""Each fault by itself, at a share of one; order, pieces, and runs that can be had again."""
+"""Each fault alone, hitting every reply; order, pieces, and repeatable runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RUNS = 200
 
 
 class EchoEnd:
-    """A far end whose first byte of a frame is the node. It answers what it is told, one pass of the loop later."""
+    """A far end that returns each frame in the next pass of the loop. The first byte of a frame is its node."""
 
     def __init__(self) -> None:
         self.received: list[bytes | int] = []
@@ -41,7 +41,7 @@ def rename(frame: bytes, rng: random.Random) -> bytes:
 
 
 def faulty(**faults: Any) -> tuple[EchoEnd, FaultyEnd, list[bytes]]:
-    """A far end, what stands before it, and what is heard."""
+    """Return a far end, the fault injector in front of it, and the list of what arrives."""
     far, received = EchoEnd(), list[bytes]()
     end = FaultyEnd(
         far, FaultOptions(**faults), asyncio.get_running_loop(), rename=rename, node_of=lambda frame: frame[0] if frame else 0
@@ -89,7 +89,7 @@ async def test_duplicate() -> None:
 
 @virtual
 async def test_truncate() -> None:
-    """Every length there is but the whole; of the empty one nothing is heard."""
+    """Every length below the whole; nothing arrives of an empty one."""
     assert set(await struck("truncate")) == {FRAME[:size] for size in range(1, len(FRAME))}
 
 
@@ -131,7 +131,7 @@ async def test_noise() -> None:
 
 @virtual
 async def test_echo() -> None:
-    """Before the answer, and the far end hears the question once."""
+    """The echo comes before the reply, and the far end receives the request once."""
     far, end, received = faulty(echo=1.0)
     end.receive(b"\x01question")
     assert received == []

@@ -1,4 +1,4 @@
-"""A line within the process: what is said and heard, one user at a time, and the plug."""
+"""A line inside the process: bytes in both directions, one user at a time, and the plug."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRAITS = LineTraits(9_600, can_change_baud=True)
 
 
 class Far:
-    """A far end that keeps what it is told and says what the test says."""
+    """A far end that records what it receives and sends what the test tells it to."""
 
     def __init__(self) -> None:
         self.received: list[bytes | int] = []
@@ -94,7 +94,7 @@ async def test_of_two_at_the_same_time_one_is_busy() -> None:
 
 @virtual
 async def test_who_reconnects_hears_of_the_loss_first() -> None:
-    """One protocol for both connections, as a bus does it: the end of the old one must not look like the end of the new one."""
+    """One protocol for both connections, as a bus does it: the end of the old one must not be taken for that of the new one."""
 
     class Diary(Receiver):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:

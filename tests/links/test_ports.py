@@ -1,4 +1,4 @@
-"""The list of ports: every name of each, and who holds it."""
+"""The list of ports: the names of each, and the process that has it open."""
 
 from __future__ import annotations
 

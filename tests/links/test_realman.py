@@ -1,4 +1,4 @@
-"""Hands behind simulated arms, over real sockets: the same verbs as on a line, and no wrong value whatever the arm says."""
+"""Hands behind simulated arms, over real sockets: the same verbs as on a line, and no wrong value whatever the arm sends."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ async def test_the_rate_changes_when_everything_is_sent() -> None:
 
 
 async def test_until_then_the_rate_is_the_old_one() -> None:
-    """Ten seconds' worth of bytes, which nobody waits for."""
+    """Bytes for ten seconds, for which no test waits."""
     receiver = Receiver()
     with plugged() as pty:
         transport = await SerialLink(pty.path, 300).connect(receiver)
@@ -141,7 +141,7 @@ async def test_no_rs485_mode() -> None:
 
 @pytest.mark.parametrize("rs485", [False, True])
 async def test_cancelled_while_it_opens(rs485: bool) -> None:
-    """What the thread opens then, or fails to, is nobody's: the port is free again, and nothing is complained about."""
+    """What the thread opens afterwards is closed again, and an error of it is ignored."""
     loop = asyncio.get_running_loop()
     problems: list[dict[str, Any]] = []
     loop.set_exception_handler(lambda loop, context: problems.append(context))
@@ -175,7 +175,7 @@ async def test_cancelled_as_it_opened() -> None:
 
 
 def test_traits_of_a_pty() -> None:
-    """Its bytes take no time, but whoever simulates may take it."""
+    """Its bytes take no time, but the simulator behind it may keep wire time."""
     with plugged() as pty:
         assert SerialLink(pty.path, 115_200).traits == LineTraits(115_200, can_change_baud=True)
 

@@ -1,4 +1,4 @@
-"""Serial links with full buffers, leaving, and being left; over real PTYs."""
+"""Serial links with full buffers, closed from either side; over real PTYs."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ async def test_unplugged_with_a_full_buffer() -> None:
 
 @on_each_loop
 async def test_unplugged_while_closing() -> None:
-    """Whoever was leaving anyway has left."""
+    """A link that was closing ends without an error."""
     receiver = Receiver()
     with plugged() as pty:
         transport, _ = await filled(pty, receiver)
@@ -131,7 +131,7 @@ async def test_unplugged_while_closing() -> None:
 
 
 async def test_the_port_is_free_when_the_loss_is_reported() -> None:
-    """Also for the next user, who finds it open for everybody."""
+    """The next user can open it, because the exclusive lock is released."""
     with plugged() as pty:
         for leave in ("close", "abort"):
             receiver = Receiver()

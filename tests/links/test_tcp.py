@@ -83,7 +83,7 @@ async def test_the_server_closes() -> None:
 
 @on_each_loop
 async def test_the_connection_breaks() -> None:
-    """A server that is reset says so with RST."""
+    """A server that is reset sends RST."""
     receiver = Receiver()
     async with serving() as server:
         await TcpLink("127.0.0.1", server.port, 115_200).connect(receiver)

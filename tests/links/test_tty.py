@@ -42,7 +42,7 @@ def held(path: str) -> Iterator[tuple[int, str]]:
 
 
 async def connecting(path: str) -> LinkDown:
-    """What connecting says."""
+    """Return the error of connecting."""
     receiver = Receiver()
     with pytest.raises(LinkDown) as caught:
         await SerialLink(path, 115_200).connect(receiver)
@@ -87,7 +87,7 @@ async def test_a_device_that_is_no_port() -> None:
 
 
 async def test_a_path_through_a_file(tmp_path: Path) -> None:
-    """What has no words of its own is told in the system's."""
+    """An error without a text of ours keeps the system's."""
     (tmp_path / "file").touch()
     error = await connecting(str(tmp_path / "file" / "ttyUSB0"))
     assert type(error) is LinkDown
@@ -117,7 +117,7 @@ async def test_busy_here() -> None:
 
 
 def test_a_busy_port_without_a_visible_holder(tmp_path: Path) -> None:
-    """Who may not look into another user's process is told how to."""
+    """A user who cannot see another user's processes is told a command that can."""
     error = explain_open_error(str(tmp_path), OSError(errno.EBUSY, "Device or resource busy"))
     assert isinstance(error, PortBusy)
     assert f"`sudo fuser -v {tmp_path}`" in str(error)
@@ -161,7 +161,7 @@ def test_denied_to_those_outside_the_group(tmp_path: Path) -> None:
 
 
 def test_denied_to_everybody(tmp_path: Path) -> None:
-    """Nobody is told to join a group that would not help."""
+    """The message does not suggest a group that would not help."""
     port = tmp_path / "ttyUSB0"
     port.touch()
     port.chmod(0o600)

@@ -1,4 +1,4 @@
-"""The simulated line: whose turn it is, what it takes, and what happens when two speak at once. In virtual time."""
+"""The simulated line: which replies come, how long bytes take, and collisions. In virtual time."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ async def test_bytes_of_a_slow_line_take_longer() -> None:
 
 @virtual
 async def test_pieces_of_a_request_queue_up() -> None:
-    """A byte handed over while another is being said is said behind it, and no time is lost between."""
+    """A byte written while another is being sent follows it without a gap."""
     async with connected([servo()]) as master:
         master.send(*(bytes((byte,)) for byte in PING))
         await master.until(1)
@@ -122,7 +122,7 @@ async def test_pieces_of_a_request_queue_up() -> None:
 
 @virtual
 async def test_the_backlog_is_the_time_of_unsent_bytes() -> None:
-    """In seconds; none once it is said."""
+    """In seconds; 0 once everything is sent."""
     async with connected([servo()]) as master:
         assert master.line.backlog() == 0
         master.send(bytes(60) + PING)
@@ -153,7 +153,7 @@ async def test_the_next_frame_queues_behind_a_broadcast(wire_time: bool) -> None
 @pytest.mark.parametrize("parts", [(PING + read_position(2),), (PING, read_position(2))], ids=["one write", "two writes"])
 @virtual
 async def test_a_master_that_does_not_wait_is_drowned(parts: tuple[bytes, ...]) -> None:
-    """The reply is heard as the AND of both, and the second request by nobody."""
+    """The AND of both arrives as the reply, and no device receives the second request."""
     async with connected([servo(1, baudrate=SLOW), servo(2, baudrate=SLOW)], baudrate=SLOW) as master:
         master.send(*parts)
         assert await master.until(1) == [overlay(ACK, read_position(2), 0)]
@@ -174,7 +174,7 @@ async def test_two_servos_of_one_id_speak_at_once(wire_time: bool) -> None:
 
 @virtual
 async def test_replies_that_overlap_in_part_are_one() -> None:
-    """A second servo of that id, later by some bytes: the master hears one long piece."""
+    """A second servo of that id replies some bytes later: the master receives one long piece."""
     async with connected([servo(), servo(return_delay=50)]) as master:
         master.send(encode(1, Instruction.READ, b"\x80\x14"))
         reply = encode(1, 0, bytes(20))
@@ -193,7 +193,7 @@ async def test_replies_that_do_not_overlap_are_two() -> None:
 
 @virtual
 async def test_sync_read_answers_one_after_another(wire_time: bool) -> None:
-    """In the order asked, whatever the order of the devices; a missing one holds nobody up."""
+    """In the order of the request, whatever the order of the devices; a missing one delays no other."""
     async with connected([servo(node, node * 100) for node in (3, 1, 2)], wire_time=wire_time) as master:
         master.send(encode(BROADCAST_ID, Instruction.SYNC_READ, bytes((0x38, 2, 2, 9, 1, 3))))
         assert await master.until(3) == [position_of(node, node * 100) for node in (2, 1, 3)]
@@ -230,7 +230,7 @@ async def test_another_rate_ends_what_was_being_sent() -> None:
 
 @virtual
 async def test_a_late_reply_comes_after_others(wire_time: bool) -> None:
-    """The delay of a fault is kept with and without wire time."""
+    """The delay of a fault counts with and without wire time."""
     slow, quick = servo(1), servo(2)
     slow.extra_delay = 0.02
     async with connected([slow, quick], wire_time=wire_time) as master:
@@ -265,7 +265,7 @@ async def test_a_closed_line_is_silent(wire_time: bool) -> None:
 
 @virtual
 async def test_a_line_nobody_listens_to_goes_on() -> None:
-    """What is said before somebody is attached is lost."""
+    """What is sent before a master is attached is lost."""
     line = SimulatedLine([servo()], SmsCodec(), asyncio.get_running_loop(), baudrate=1_000_000, wire_time=False)
     line.receive(PING)
     await asyncio.sleep(0)

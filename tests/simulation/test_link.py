@@ -1,4 +1,4 @@
-"""From options to a simulated line: what the port says, what the link states, and what outlives a connection."""
+"""Links to simulated lines: the port, the traits, and what outlives a connection."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ACK = encode(1, 0)
 
 
 class Receiver(asyncio.Protocol):
-    """Keeps what it hears, and whether it was told of the end."""
+    """Records what it receives, and whether the end was reported."""
 
     def __init__(self) -> None:
         self.received = b""
@@ -34,7 +34,7 @@ class Receiver(asyncio.Protocol):
         self._news.set()
 
     async def until(self, count: int) -> bytes:
-        """All that was heard, once it is so many bytes."""
+        """Return what was received, once it has this many bytes."""
         async with asyncio.timeout(1):
             while len(self.received) < count:
                 self._news.clear()
@@ -72,7 +72,7 @@ def test_a_port_says_whether_bytes_take_time() -> None:
 )
 @virtual
 async def test_the_link_states_what_its_line_is(keys: dict[str, Any], traits: LineTraits) -> None:
-    """An injected echo keeps no wire time, so such a line does not claim to."""
+    """An injected echo takes no wire time, and the traits of the line say so."""
     with closing(link_of(**keys)) as link:
         assert link.traits == traits
         assert link.address == keys.get("port", "sim:")
@@ -110,7 +110,7 @@ async def test_a_line_is_opened_at_the_rate_of_its_config() -> None:
 
 @virtual
 async def test_faults_stand_between() -> None:
-    """Here every reply is said twice."""
+    """Every reply is sent twice."""
     with closing(link_of(faults={"duplicate": 1.0})) as link:
         receiver = Receiver()
         (await link.connect(receiver)).write(PING)

@@ -1,4 +1,4 @@
-"""The PTY at which a simulated line is opened by others: rates, users that come and go, and the plug."""
+"""The PTY in front of a simulated line: rates, users that come and go, and the plug."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servobus.simulation.pty import FULL, HALF, SimulatedPty
 
 
 class EchoEnd:
-    """A far end that keeps what it is told."""
+    """A far end that records what it receives."""
 
     def __init__(self) -> None:
         self.sent: list[bytes | int] = []
@@ -34,7 +34,7 @@ class EchoEnd:
         self._news.set()
 
     async def news(self) -> list[bytes | int]:
-        """All it was told since the last time."""
+        """Return what it received since the last call."""
         async with asyncio.timeout(10):
             await self._news.wait()
         self._news.clear()
@@ -67,7 +67,7 @@ async def test_users_come_and_go() -> None:
 
 
 async def test_rate_0_is_no_rate() -> None:
-    """Whoever hangs up (B0) has not chosen a rate."""
+    """A hang-up (B0) is not a choice of a rate."""
     far = EchoEnd()
     pty = SimulatedPty(far, asyncio.get_running_loop())
     with serial.Serial(pty.path, 0) as port:
@@ -77,7 +77,7 @@ async def test_rate_0_is_no_rate() -> None:
 
 
 async def test_what_nobody_reads_is_dropped_and_counted() -> None:
-    """A line does not wait and does not grow; afterwards it goes on."""
+    """The line does not wait and its buffer does not grow; afterwards it works again."""
     far = EchoEnd()
     pty = SimulatedPty(far, asyncio.get_running_loop())
     with serial.Serial(pty.path, 115_200, timeout=10) as port:
@@ -114,7 +114,7 @@ async def test_a_user_who_says_too_much_waits() -> None:
 
 
 async def test_the_plug_can_be_pulled_while_a_user_waits() -> None:
-    """Nothing goes on then."""
+    """Nothing is read after that."""
     far = EchoEnd()
     pty = SimulatedPty(far, asyncio.get_running_loop(), backlog=lambda: HALF + FULL)
     with serial.Serial(pty.path, 115_200) as port:
@@ -126,7 +126,7 @@ async def test_the_plug_can_be_pulled_while_a_user_waits() -> None:
 
 
 async def test_closing_pulls_the_plug() -> None:
-    """The user gets an error, the path is gone, and what is said then goes nowhere."""
+    """The user gets an error, the path is gone, and later bytes are dropped."""
     far = EchoEnd()
     pty = SimulatedPty(far, asyncio.get_running_loop())
     user = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)

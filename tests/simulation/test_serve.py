@@ -1,4 +1,4 @@
-"""Simulated buses as other programs meet them: names, paths, rates, faults, and the end."""
+"""Simulated buses as other programs use them: names, paths, rates, faults, and the end."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ async def test_each_bus_has_its_own_port() -> None:
 
 
 async def test_a_servo_follows_its_baud_register() -> None:
-    """It answers at the old rate, then hears only the new one."""
+    """It replies at the old rate, then receives only at the new one."""
     async with served({"arm": bus(1_000_000, 1, 2)}) as paths, asyncio.timeout(10):
         with serial.Serial(paths["arm"], 1_000_000) as port:
             assert await ask(port, encode(1, Instruction.WRITE, b"\x06\x04"), 6) == encode(1, 0)

@@ -1,4 +1,4 @@
-"""Abort codes of error replies (KST RS422, 9): their texts, the error that each becomes, and the order of their four bytes.
+"""Abort codes of error replies (KST RS422, 3.9): their texts, the error that each becomes, and the order of their four bytes.
 
 The document prints a code as two 16-bit numbers and does not say which byte comes first. No known code is another one with its
 bytes reversed, so with `auto` a code that is known in only one order tells the order. Until then it is big-endian, as printed.

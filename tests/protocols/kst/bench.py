@@ -21,7 +21,7 @@ from servobus.values import Goal, ServoGoal
 R = TypeVar("R")
 TRIES = 3
 steady = settings(deadline=None, derandomize=True)
-"""For properties: the same examples in each run, and no opinion on how long they take."""
+"""For property tests: the same examples in each run, without a time limit."""
 
 
 def frame_of(data: bytes) -> Frame:
@@ -42,7 +42,7 @@ def changed_model(**parts: Any) -> KstModel:
 
 
 class Bench:
-    """A driver and its servos on a line that takes no time. Nothing is lost but what `loses` says."""
+    """A driver and its servos on a line that takes no time. `loses` decides which replies are lost."""
 
     def __init__(self, servos: dict[str, dict[str, Any]] | None = None, *, model: KstModel | None = None, **keys: Any) -> None:
         self.options = bus_options(servos, **keys)
@@ -52,7 +52,7 @@ class Bench:
         self.now = 0.0
         self.baudrate = self.options.baudrate
         self.sent: list[Request[Any]] = []
-        """What the master said, repetitions included."""
+        """The requests sent, including repetitions."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
 
     def exchange(self, request: Request[Any]) -> Any:
@@ -70,7 +70,7 @@ class Bench:
         return run_plan(plan, self.exchange)
 
     def frames(self) -> list[bytes]:
-        """What was said since the last call."""
+        """Return the frames sent since the last call."""
         sent, self.sent = self.sent, []
         return [request.frame for request in sent]
 

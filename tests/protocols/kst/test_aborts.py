@@ -1,4 +1,4 @@
-"""Abort codes: every one the specification prints, in either byte order, as the error it stands for."""
+"""Abort codes: each code of KST RS422, 3.9, in either byte order, becomes its error."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_table_is_the_specification_s_and_two_newer_ones() -> None:
 @pytest.mark.parametrize("code", ABORTS)
 @pytest.mark.parametrize("order", ["big", "little"])
 def test_every_code_in_either_order(code: int, order: Literal["big", "little"]) -> None:
-    """K1."""
+    """KST RS422, 3.9: the order of the code's four bytes is not stated."""
     data = code.to_bytes(4, order)
     reader = AbortReader()
     error = reader.error(7, "set position", data + bytes(4), raw=b"frame")

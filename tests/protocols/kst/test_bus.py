@@ -1,4 +1,4 @@
-"""KST servos on the engine: a simulated line with real timing time, in virtual time."""
+"""KST servos on a bus: a simulated line whose bytes take their time, in virtual time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FAULTS = {
 async def running(
     faults: FaultOptions | None = None, **keys: Any
 ) -> AsyncIterator[tuple[BusService, list[KstDevice], list[str]]]:
-    """The service of a bus of two servos, its devices, and the events it told."""
+    """Return the service of a bus of two servos, its devices, and the names of its events."""
     loop = asyncio.get_running_loop()
     options = bus_options({"pan": {"id": 1}, "tilt": {"id": 2}}, poll={"feedback": 50, "health": 5}, **keys)
     models = DEFINITION.models(options, Path())
@@ -110,7 +110,7 @@ def test_every_value_is_right_or_a_typed_error(name: str) -> None:
 
 @virtual
 async def test_a_servo_that_restarts_is_disabled() -> None:
-    """K21."""
+    """KST RS422, 3.5: after a restart the position is a default value."""
     async with running() as (bus, servos, events):
         await bus.motion.enable("pan")
         await move(bus, pan=80)

@@ -1,4 +1,4 @@
-"""Frames found in a stream, whatever surrounds them and however they are cut."""
+"""Frames are decoded from a stream, whatever bytes surround them and however they are cut."""
 
 from __future__ import annotations
 
@@ -86,14 +86,14 @@ def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, how: str) -> None:
 
 @DELIVERIES
 def test_a_half_frame_does_not_swallow_the_next_one(how: str) -> None:
-    """K8: whether a servo gives up half a frame is not told; this end always finds the next one."""
+    """Whether a servo gives up half a frame is not stated; this end always finds the next one."""
     for cut in range(SIZE):
         assert frames_in(*chopped(REPLY[:cut] + READ, how)) == [READ]
 
 
 @DELIVERIES
 def test_header_and_trailer_inside_the_data_do_not_mislead(how: str) -> None:
-    """K22."""
+    """KST RS422, 2: header and trailer may occur in the data."""
     inside = encode(0xFE, 0x5A, b"\xfe\xca\x0a\xfe")
     assert frames_in(*chopped(b"\xfe" + inside + b"\xca" + inside, how)) == [inside, inside]
 
@@ -108,7 +108,7 @@ def test_every_byte_of_a_frame_counts(at: int) -> None:
 
 
 def test_another_version_byte_is_no_frame_unless_it_is_the_one_set() -> None:
-    """K6."""
+    """KST RS422, 2: the version byte is a constant."""
     other = encode(0x25, Command.READ_ID, version=0xCB)
     assert frames_in(other) == []
     assert frames_in(other, codec=KstCodec(0xCB)) == [other]
@@ -117,7 +117,7 @@ def test_another_version_byte_is_no_frame_unless_it_is_the_one_set() -> None:
 
 @pytest.mark.parametrize(("code", "size"), [(code, size) for code, size in DATA_SIZES.items() if size < DATA_SIZE])
 def test_unused_data_bytes_must_be_zero_unless_that_is_ignored(code: int, size: int) -> None:
-    """K14."""
+    """KST RS422, 2.3: unused data bytes are 0."""
     full, over = encode(1, code, b"\1" * size), encode(1, code, b"\1" * (size + 1))
     assert frames_in(full, over, codec=KstCodec()) == [full]
     assert frames_in(full, over, codec=KstCodec(strict=False)) == [full, over]
@@ -184,7 +184,7 @@ def test_what_a_frame_cannot_carry_is_refused(address: int, code: int, data: byt
 
 
 def test_a_reply_has_the_key_of_the_command_it_answers() -> None:
-    """K15: replies and refusals of one command can be taken for each other, and nothing else."""
+    """Replies and refusals of one command can be confused, and nothing else (KST RS422, 2.2)."""
     assert {frame_of(encode(7, code)).key for code in (0x19, 0x59, 0xD9)} == {0x19}
     frame = frame_of(REPLY)
     assert (frame.node, frame.status, frame.refused) == (0x25, None, False)
@@ -215,7 +215,7 @@ def test_renaming_gives_another_servo_the_same_frame() -> None:
     ],
 )
 def test_a_version_is_text_if_all_of_it_can_be_printed(data: bytes, text: str) -> None:
-    """K10."""
+    """KST RS422, 3.8: the version is four bytes of text."""
     assert version_text(data) == text
 
 

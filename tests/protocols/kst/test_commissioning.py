@@ -43,7 +43,7 @@ def test_a_new_id_is_read_back_saved_and_answers_after_a_restart() -> None:
 
 
 def test_until_the_restart_the_old_id_answers_and_reports_the_change() -> None:
-    """K5."""
+    """KST RS422, 3.1, 3.2: a change is in effect after save and restart."""
     bench, commissioning = new_servo()
     bench.run(commissioning.set_id(FACTORY_ID, 5))
     assert bench.run(bench.driver.identify("new")).notes == (
@@ -56,7 +56,7 @@ def test_until_the_restart_the_old_id_answers_and_reports_the_change() -> None:
 
 
 def test_a_second_change_is_refused_while_one_waits() -> None:
-    """K5."""
+    """KST RS422, 3.1, 3.2: a change is in effect after save and restart."""
     bench, commissioning = new_servo()
     bench.run(commissioning.set_id(FACTORY_ID, 5))
     bench.frames()
@@ -79,7 +79,7 @@ def test_a_change_that_was_not_saved_is_lost_by_the_restart() -> None:
 
 
 def test_a_saved_change_that_the_servo_did_not_keep_is_over() -> None:
-    """After the restart nobody answers at the new id, and the servo answers at its old one."""
+    """After the restart the servo answers at its old id, not at the new one."""
     bench, commissioning = new_servo()
     bench.run(commissioning.set_id(FACTORY_ID, 5))
     commissioning.pending[FACTORY_ID] = replace(commissioning.pending[FACTORY_ID], saved=True)
@@ -125,7 +125,7 @@ def test_an_address_that_answers_with_another_id_is_not_the_one() -> None:
 
 
 def test_a_new_rate_is_echoed_and_counts_after_save_and_restart() -> None:
-    """K18: no command reads a rate back."""
+    """KST RS422, 3.1: no command reads a rate back."""
     bench, commissioning = new_servo()
     change = bench.run(commissioning.set_baudrate(FACTORY_ID, 115_200, save=True))
     assert (change.what, change.value, change.saved) == ("baudrate", 115_200, True)
@@ -137,7 +137,7 @@ def test_a_new_rate_is_echoed_and_counts_after_save_and_restart() -> None:
 
 
 def test_an_own_baud_table_is_obeyed() -> None:
-    """K18."""
+    """KST RS422, 3.1: eight baud rates."""
     bench, commissioning = new_servo(baud_table={6: 512_000, 9: 1_000_000})
     bench.run(commissioning.set_baudrate(FACTORY_ID, 1_000_000))
     assert encode(FACTORY_ID, Command.SET_BAUD, b"\x09") in bench.frames()
@@ -147,7 +147,7 @@ def test_an_own_baud_table_is_obeyed() -> None:
 
 @pytest.mark.parametrize(("new", "fits"), [(0, False), (1, True), (254, True), (255, False)])
 def test_which_ids_may_be_given(new: int, fits: bool) -> None:
-    """K16."""
+    """KST RS422, 2.1: ids are 0x00 to 0xFF, and 0x00 is the broadcast."""
     bench, commissioning = new_servo()
     if fits:
         assert bench.run(commissioning.set_id(FACTORY_ID, new)).value == new
@@ -157,7 +157,7 @@ def test_which_ids_may_be_given(new: int, fits: bool) -> None:
 
 
 def test_id_255_is_warned_of() -> None:
-    """K16."""
+    """KST RS422, 2.1: ids are 0x00 to 0xFF, and 0x00 is the broadcast."""
     bench, commissioning = new_servo(id_range=[1, 255])
     assert "silent line" in bench.run(commissioning.set_id(FACTORY_ID, 255)).notes[0]
 
@@ -185,7 +185,7 @@ def test_its_own_id_may_be_given_again() -> None:
 
 
 def test_nothing_is_changed_where_two_servos_are_suspected() -> None:
-    """K17."""
+    """KST RS422, 1: every new servo has the id 0x25."""
     bench, commissioning = new_servo()
     bench.devices.append(device_of(position=111))
     for plan in (commissioning.set_id(FACTORY_ID, 5), commissioning.set_baudrate(FACTORY_ID, 9600)):
@@ -223,7 +223,7 @@ def test_a_servo_that_says_another_id_afterwards_is_not_saved() -> None:
     assert not any(frame[3] == Command.SAVE for frame in bench.frames())
 
 
-# Save: K4
+# Save (KST RS422, 3.3)
 
 
 def test_save_waits_for_no_answer_and_leaves_the_flash_its_time() -> None:
@@ -264,7 +264,7 @@ def test_a_required_answer_must_come() -> None:
         bench.run(commissioning.save(FACTORY_ID))
 
 
-# Where changes take effect at once: K5
+# Where changes take effect at once
 
 
 def test_an_id_that_counts_at_once_is_read_back_and_saved_there() -> None:

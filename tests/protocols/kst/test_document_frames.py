@@ -1,4 +1,4 @@
-"""The specification's own tables and layouts, and the frames computed from them."""
+"""The tables and frame layouts of KST RS422, and frames computed from them."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_the_computed_frames(address: int, code: int, data: bytes, frame: str) -
 
 
 def test_save_needs_no_reply_and_gives_the_flash_its_time() -> None:
-    """Section 3.3; K4."""
+    """KST RS422, 3.3: no reply is needed."""
     save = UnansweredCommand(SETTINGS, 0x25, Command.SAVE, b"save")
     assert save.frame == bytes.fromhex("FECA250F7361766500000000AD0A")
     assert (save.replies, save.idempotent, save.quiet_after) == (0, False, 0.2)

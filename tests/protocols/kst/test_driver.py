@@ -47,7 +47,7 @@ def test_the_host_keeps_no_speed_from_an_unknown_position() -> None:
 
 
 def test_ping_reads_the_id() -> None:
-    """K20."""
+    """KST RS422, 3, has no torque, stop or speed command."""
     bench = Bench()
     assert bench.exchange(bench.driver.ping(2)) is None
     assert bench.frames() == [encode(2, Command.READ_ID)]
@@ -90,7 +90,7 @@ def test_polls_ask_each_servo_that_is_reachable() -> None:
 
 
 def test_status_bits_are_reported_only_where_they_have_a_name() -> None:
-    """K9."""
+    """KST RS422, 3.7: the two status bytes are defined as needed."""
     assert Bench().driver.fault_names("pan", 0xFFFF) == ()
     bench = Bench(status_bits={15: "stalled", 1: "hot"})
     assert bench.driver.fault_names("pan", 0xFFFF) == ("hot", "stalled")
@@ -101,7 +101,7 @@ def test_status_bits_are_reported_only_where_they_have_a_name() -> None:
 
 
 def test_a_position_outside_the_range_is_flagged() -> None:
-    """K11."""
+    """KST RS422, 3.5: -90 to +90 degrees."""
     bench = Bench()
     bench.devices[0].position = bench.devices[0].goal = 920
     assert bench.exchange(bench.driver.read_state("pan")) == {"pan": {"position": 92}}
@@ -123,7 +123,7 @@ def test_a_position_outside_the_range_is_flagged() -> None:
     ],
 )
 def test_what_can_be_read_by_name(name: str, value: object, raw: int) -> None:
-    """K10, K23."""
+    """KST RS422, 3.4 to 3.8."""
     bench = Bench()
     bench.devices[0].position = bench.devices[0].goal = -109
     bench.devices[0].status_bytes = b"\x12\x34"
@@ -132,7 +132,7 @@ def test_what_can_be_read_by_name(name: str, value: object, raw: int) -> None:
 
 
 def test_reading_may_bring_the_goal() -> None:
-    """K23."""
+    """KST RS422, 3.6: whether the actual or the commanded position is read is not stated."""
     bench = Bench()
     bench.devices[0].reads_goal = True
     bench.run(bench.driver.enable("pan"))
@@ -168,7 +168,7 @@ def test_unknown_names_are_refused() -> None:
 
 
 def test_enable_reads_the_position_and_writes_nothing() -> None:
-    """K20, K21, K23."""
+    """There is no torque command, and to write a reading could move the servo."""
     bench = Bench()
     bench.devices[0].position = bench.devices[0].goal = 250
     assert bench.run(bench.driver.enable("pan")) == 25
@@ -213,7 +213,7 @@ def test_a_plan_outside_the_range_is_refused_too() -> None:
 
 
 def test_a_lenient_and_other_version_line_works_end_to_end() -> None:
-    """K6, K14."""
+    """The version byte and the check of unused data bytes can be changed."""
     bench = Bench(version_byte=0xCB, pad_check="ignore", min_gap_us=100)
     assert run_plan(bench.driver.identify("pan"), bench.exchange).firmware == "1.00"
     assert {request.frame[1] for request in bench.sent} == {0xCB}

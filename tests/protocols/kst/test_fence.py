@@ -1,4 +1,4 @@
-"""Fences, and what tells a servo that has restarted."""
+"""Fences, and how a restart is detected."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_fence_that_was_not_answered_is_followed_by_another_kind() -> None:
 
 
 def test_after_a_fence_the_position_is_read_once() -> None:
-    """Said twice, the answer to the first question could be taken for that to the second."""
+    """If it was sent twice, the reply to the first read could be taken for that to the second."""
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
     bench.frames()
@@ -52,7 +52,7 @@ def test_after_a_fence_the_position_is_read_once() -> None:
 
 
 def test_a_late_answer_never_passes_for_a_newer_one() -> None:
-    """A servo that answers in order, and late: whatever it says is older than what was asked last, until the fence has passed."""
+    """The servo replies in order and late: until the reply to the fence, each reply belongs to an older request."""
     bench = Bench()
     asked = bench.driver.read_register("pan", "position")
     plan = bench.driver.fence(1, [asked.reply_key], ())
@@ -77,7 +77,7 @@ def test_after_a_new_id_the_fence_knows_both() -> None:
 
 
 def test_a_servo_that_stands_where_nobody_sent_it_has_restarted() -> None:
-    """K21."""
+    """KST RS422, 3.5: after a restart the position is a default value."""
     bench = Bench()
     bench.run(bench.driver.enable("pan"))
     assert bench.run(bench.driver.fence(1, [], bench.driver.nodes))

@@ -1,4 +1,4 @@
-"""Goals as addressed frames that are confirmed, and how everything comes to rest."""
+"""Goals of KST servos, each confirmed by its reply, and stops."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_goal_without_reply_is_repeated_and_may_have_been_obeyed() -> None:
 
 
 def test_a_wrong_echo_fails_the_goal() -> None:
-    """K12."""
+    """KST RS422, 3.5: the reply repeats the position."""
     bench = enabled()
     bench.devices[0].answers = {Command.SET_POSITION: encode_position(1)}
     assert isinstance(move(bench, pan=10)["pan"], EchoMismatch)
@@ -114,7 +114,7 @@ def test_a_hardware_fault_latches_until_the_servo_is_enabled_again() -> None:
 
 
 def test_a_stop_says_the_last_confirmed_setpoint_once_more() -> None:
-    """K20, K23: what a read brings may be the goal itself."""
+    """There is no stop command, and a reading may be the goal itself (KST RS422, 3.6)."""
     bench = enabled()
     move(bench, pan=10)
     bench.frames()
@@ -170,7 +170,7 @@ def test_a_stop_reads_a_position_that_it_does_not_have() -> None:
 
 
 def test_a_servo_that_has_restarted_is_not_sent_back() -> None:
-    """K21."""
+    """KST RS422, 3.5: after a restart the position is a default value."""
     bench = enabled()
     move(bench, pan=80)
     bench.after(1.0).exchange(bench.driver.read_state("pan"))
@@ -190,7 +190,7 @@ def test_a_latched_fault_does_not_keep_a_stop_back() -> None:
 
 
 def test_disable_closes_the_gate_and_says_nothing() -> None:
-    """K20."""
+    """KST RS422, 3, has no torque, stop or speed command."""
     bench = enabled()
     assert bench.run(bench.driver.disable("pan")) == StopReport("hold", False, True, HOLDS)
     assert bench.frames() == []

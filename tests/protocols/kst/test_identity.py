@@ -1,4 +1,4 @@
-"""Who answers, and whether it is one: a clash of two servos is suspected, and named."""
+"""Who answers at an address, and when two servos with one id are suspected."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_one_servo_raises_no_suspicion() -> None:
 
 
 def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
-    """K17."""
+    """KST RS422, 1: every new servo has the id 0x25."""
     bench = factory_bench()
     bench.devices.append(device_of(position=111))
     (note,) = bench.run(bench.driver.inspect(FACTORY_ID)).notes
@@ -32,7 +32,7 @@ def test_two_new_servos_at_different_places_are_suspected_by_name() -> None:
 
 @pytest.mark.parametrize("position", [0, -333])
 def test_two_servos_with_equal_replies_are_taken_for_one(position: int) -> None:
-    """K17: a clash is never excluded. The answers 0 and -333 at once make the very frame of the answer 0."""
+    """A clash is never excluded. The answers 0 and -333 at once make the very frame of the answer 0."""
     bench = factory_bench()
     bench.devices.append(device_of(position=position))
     assert bench.run(bench.driver.inspect(FACTORY_ID)).notes == ()

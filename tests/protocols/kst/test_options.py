@@ -1,4 +1,4 @@
-"""The keys of a KST bus: the defaults are the safe rulings, and what cannot be is refused with its reason."""
+"""The keys of a KST bus: the defaults are safe, and an impossible value is refused with its reason."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def refusal(**keys: Any) -> str:
 
 
 def test_the_defaults_are_the_safe_choices() -> None:
-    """K1 to K19, where they are a key of the bus."""
+    """Each thing that the document leaves open has a key with a safe default."""
     options = bus_options()
     assert (options.baudrate, options.duplex) == (512_000, "half")
     assert options.sdo_order == "auto"
@@ -51,7 +51,7 @@ def test_what_has_no_command_is_refused(key: str) -> None:
 
 @pytest.mark.parametrize(("number", "fits"), [(0, False), (1, True), (254, True), (255, False), (256, False)])
 def test_ids_are_1_to_254(number: int, fits: bool) -> None:
-    """K16."""
+    """KST RS422, 2.1: ids are 0x00 to 0xFF, and 0x00 is the broadcast."""
     servos = {"pan": {"id": number}}
     if fits:
         assert bus_options(servos).servos["pan"].id == number
@@ -68,7 +68,7 @@ def test_id_255_is_there_for_those_who_ask() -> None:
 
 
 def test_a_rate_the_servos_do_not_have_is_refused() -> None:
-    """K18."""
+    """KST RS422, 3.1: eight baud rates."""
     assert "baudrate: 1000000 is not one of the servos' rates 9600, 19200" in refusal(baudrate=1_000_000)
     assert bus_options(baudrate=1_000_000, baud_table={8: 1_000_000}).baudrate == 1_000_000
     assert bus_options(baudrate=921_600).baudrate == 921_600
@@ -90,7 +90,7 @@ def test_other_values_and_unknown_keys_are_refused(keys: dict[str, Any]) -> None
 
 
 def test_the_codec_follows_the_options() -> None:
-    """K6, K14."""
+    """The version byte and the check of unused data bytes can be changed."""
     options = bus_options(version_byte=0xCB, pad_check="ignore")
     lenient, strict = codec(options), codec()
     for made in (lenient, strict):
@@ -154,7 +154,7 @@ def test_a_model_needs_degrees_and_commands() -> None:
 
 @pytest.mark.parametrize(("ends", "fits"), [([-90, 90], True), ([-90.1, 90], False), ([-90, 90.1], False), ([-10, 10], True)])
 def test_a_range_is_no_wider_than_the_model_s(ends: list[float], fits: bool) -> None:
-    """K11."""
+    """KST RS422, 3.5: -90 to +90 degrees."""
     options = bus_options({"pan": {"id": 1, "range_deg": ends}})
     if fits:
         assert load_models(options, Path())

@@ -1,4 +1,4 @@
-"""What answers a request and what does not, and what is said to all."""
+"""Which replies answer a request, and what silence follows it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SETTINGS = RequestSettings()
 
 
 def test_only_the_reply_and_the_refusal_of_its_own_command_answer() -> None:
-    """K15."""
+    """KST RS422, 2.2: a reply has the command's code plus 0x40, a refusal plus 0xC0."""
     request = Read(SETTINGS, 7, Command.READ_POSITION, decode_position)
     accepted = [code for code in range(256) if request.answers(frame_of(encode(7, code)))]
     assert accepted == [0x59, 0xD9]
@@ -40,7 +40,7 @@ def test_a_refusal_is_the_error_of_its_code() -> None:
 
 
 def test_another_value_than_the_one_sent_is_a_mismatch() -> None:
-    """K12."""
+    """KST RS422, 3.5: the reply repeats the position."""
     request = SetValue(SETTINGS, 7, Command.SET_POSITION, encode_position(-109))
     request.parse([frame_of(encode(7, 0x49, encode_position(-109)))])
     with pytest.raises(EchoMismatch, match="set position: 94 ff was confirmed, 93 ff was sent") as caught:
@@ -67,7 +67,7 @@ def test_which_requests_may_be_repeated() -> None:
 
 
 def test_the_reply_to_a_new_id_may_come_from_the_new_id() -> None:
-    """K5."""
+    """KST RS422, 3.1, 3.2: a change is in effect after save and restart."""
     reply = frame_of(encode(5, 0x48, b"\5"))
     assert not SetValue(SETTINGS, 1, Command.SET_ID, b"\5").answers(reply)
     request = SetValue(SETTINGS, 1, Command.SET_ID, b"\5", also=5)
@@ -92,7 +92,7 @@ def test_a_fence_is_passed_by_any_answer_to_it_but_another_id() -> None:
 
 
 def test_silence_after_what_is_not_answered() -> None:
-    """K2, K4, K7."""
+    """The document gives no times, so the line stays silent as long as a reply could take."""
     settings = RequestSettings(gap=0.001, guard=0.004, flash_time=0.3)
     assert Read(settings, 1, Command.READ_ID, bytes).quiet_after == 0.001
     assert UnansweredCommand(settings, 1, Command.SET_POSITION, bytes(2)).quiet_after == 0.004

@@ -1,4 +1,4 @@
-"""A configured servo: degrees and steps, the range at its edges, and where it can be at all."""
+"""A configured servo: degrees and steps, the edges of its range, and its travel range."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def steps(raw: int) -> bytes:
     ],
 )
 def test_the_nearest_step_and_ties_to_even(position: float, raw: int) -> None:
-    """K13."""
+    """KST RS422, 3.5: a step is 0.1 degrees."""
     assert fitted().to_raw(position) == raw
 
 
@@ -55,7 +55,7 @@ def test_the_ends_of_the_range_pass(position: float) -> None:
 
 @pytest.mark.parametrize("position", [90.1, -90.1, 90.01, -90.01, 3276.8, 1e300])
 def test_outside_the_range_is_refused_however_little(position: float) -> None:
-    """K11."""
+    """KST RS422, 3.5: -90 to +90 degrees."""
     with pytest.raises(LimitError, match=r"pan: position .* is outside the servo's range -90 to 90: nothing was sent"):
         fitted().to_raw(position)
 
@@ -111,7 +111,7 @@ def test_no_step_is_further_than_half_of_one(position: float) -> None:
     [(900, True, False), (901, True, True), (950, True, True), (951, False, False), (-950, True, True), (-951, False, False)],
 )
 def test_a_reading_outside_is_a_fault_and_far_outside_refused(raw: int, believed: bool, outside: bool) -> None:
-    """K11."""
+    """KST RS422, 3.5: -90 to +90 degrees."""
     servo = fitted()
     if believed:
         assert servo.decode_position(steps(raw)) == {"position": raw / 10}
@@ -129,7 +129,7 @@ def test_the_flag_goes_when_it_is_back() -> None:
 
 
 def test_status_bytes_are_raw() -> None:
-    """K9."""
+    """KST RS422, 3.7: the two status bytes are defined as needed."""
     servo = fitted()
     assert servo.decode_status(b"\x01\x80" + bytes(6)) == {"status": 0x8001}
     assert servo.status == 0x8001
@@ -140,7 +140,7 @@ def test_status_bytes_are_raw() -> None:
 
 @pytest.mark.parametrize(("raw", "jumped"), [(350, False), (351, True), (50, False), (49, True)])
 def test_a_servo_outside_its_travel_range_has_jumped(raw: int, jumped: bool) -> None:
-    """K21: on the way from 10 to 30 degrees, and five more on each side, anything is possible."""
+    """Between 10 and 30 degrees, and five more on each side, any reading is possible."""
     travel = fitted().travel
     travel.begin(100)
     travel.send(300)

@@ -1,4 +1,4 @@
-"""Frames found in a stream, at both ends of the line, whatever surrounds them and however they are cut."""
+"""Frames are decoded from a stream, at both ends of the line, whatever surrounds them and however they are cut."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_what_is_no_frame_is_skipped_and_counted(junk: bytes, end: str, how: str
 @DELIVERIES
 @pytest.mark.parametrize("end", ["master", "device"])
 def test_a_half_frame_swallows_no_more_than_the_longest_frame(end: str, how: str) -> None:
-    """What it begins may be as long as its byte count says; whoever speaks next resets the codec anyway."""
+    """A frame that begins may be as long as its byte count; the next request resets the codec."""
     frames = RECEIVED if end == "master" else ASKED
     for frame in frames:
         for cut in range(len(frame)):

@@ -1,4 +1,4 @@
-"""Questions, and which frames are their answers. Golden frames: the seed (errata R1 to R4 resolved) and the reference page."""
+"""Requests, and which frames answer them. Golden frames: the examples of ROH Modbus, with their high and low bytes in order."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_an_answer_fits_in_unit_function_count_and_echo() -> None:
 
 @pytest.mark.parametrize("address", range(0x300, 0x400, 15))
 def test_the_echo_of_a_read_is_no_answer(address: int) -> None:
-    """Catalogue 15: for these registers it looks like an answer of three bytes."""
+    """The write reply for these registers looks like a read reply of three bytes."""
     for count in range(1, 5):
         asked = read(address, count)
         assert not asked.answers(frame(asked.frame))

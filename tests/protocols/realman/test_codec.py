@@ -1,4 +1,4 @@
-"""The arm's lines: golden commands of both sets, and what is and is not an answer."""
+"""The arm's JSON lines: golden commands of both sets, and which replies answer them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modbus questions as commands: as few as the arm carries, addresses that go on where the last ended."""
+"""Modbus requests as the arm's commands: the fewest it can carry, at consecutive addresses."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def bus_options(servos: dict[str, dict[str, Any]] | None = None, **keys: Any) ->
 
 
 class Bench:
-    """A driver and its hands on a line that takes no time. Nothing is lost but what `loses` says."""
+    """A driver and its hands on a line that takes no time. `loses` decides which replies are lost."""
 
     def __init__(
         self, servos: dict[str, dict[str, Any]] | None = None, *, maps: dict[int, str] | None = None, **keys: Any
@@ -67,7 +67,7 @@ class Bench:
         ]
         self.now = 0.0
         self.sent: list[Request[Any]] = []
-        """What the master said, repetitions included."""
+        """The requests sent, including repetitions."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
 
     @property
@@ -98,7 +98,7 @@ class Bench:
         return run_plan(plan, self.exchange)
 
     def frames(self) -> list[str]:
-        """What was said since the last call, in words."""
+        """Return a description of each frame sent since the last call."""
         sent, self.sent = self.sent, []
         return [ModbusCodec().describe(request.frame, sent=True) for request in sent]
 
@@ -128,7 +128,7 @@ class Bench:
 
 
 def bench_of(name: str, **keys: Any) -> Bench:
-    """One hand that has this map, whatever the config says."""
+    """One hand with this map, which the config does not name."""
     return Bench(maps={2: name}, **keys)
 
 

@@ -1,4 +1,4 @@
-"""Hands on the engine: a simulated line with real timing time, in virtual time."""
+"""Hands on a bus: a simulated line whose bytes take their time, in virtual time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TWO = {"a": {"id": 2, "channel": "index"}, "b": {"id": 2, "channel": "ring"}, "c
 async def running(
     servos: dict[str, dict[str, Any]], faults: FaultOptions | None = None, **keys: Any
 ) -> AsyncIterator[tuple[BusService, list[RohDevice], list[str]]]:
-    """The service of a line, its hands, and the events it told."""
+    """Return the service of a line, its hands, and the names of its events."""
     loop = asyncio.get_running_loop()
     options = bus_options(servos, poll={"feedback": 20, "health": 5}, **keys)
     models = DEFINITION.models(options, Path())

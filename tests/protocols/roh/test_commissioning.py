@@ -1,4 +1,4 @@
-"""What restarts, re-addresses or recalibrates a hand is told once."""
+"""Commands that restart, re-address or recalibrate a hand are sent once."""
 
 from __future__ import annotations
 

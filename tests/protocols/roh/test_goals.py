@@ -1,4 +1,4 @@
-"""Goals on their way to the fingers, and fingers on their way to rest."""
+"""Goals of fingers in the fewest writes, their settings, and previews."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def verbs(driver: RohDriver) -> dict[str, Plan[Any]]:
 @pytest.mark.parametrize("registers", [[], [0x0200]])
 @pytest.mark.parametrize("verb", ["identify", "goals", "enable", "write", "stop", "command"])
 def test_an_empty_answer_opens_no_gate(verb: str, registers: list[int]) -> None:
-    """Nothing is written before the hand has told its map, whatever a plan is sent."""
+    """Nothing is written before the map is known, whatever reply a plan gets."""
     driver = Bench().driver
     sent: list[int] = []
 

@@ -1,4 +1,4 @@
-"""What a config may say of hands, and what the map files say."""
+"""The keys of a line of hands, and the register maps."""
 
 from __future__ import annotations
 

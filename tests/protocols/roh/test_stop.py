@@ -1,4 +1,4 @@
-"""Fingers on their way to rest."""
+"""Stops of fingers."""
 
 from __future__ import annotations
 

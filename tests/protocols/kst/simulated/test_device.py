@@ -1,4 +1,4 @@
-"""The simulated servo keeps the rules of the specification."""
+"""The simulated servo follows KST RS422, 3."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_it_moves_at_a_finite_speed_and_stays_where_it_was_sent() -> None:
 
 
 def test_only_a_position_is_obeyed_as_a_broadcast_and_not_answered() -> None:
-    """K2, K3."""
+    """KST RS422, 2.1: servobus sends no broadcast; whether one is answered is not stated."""
     device = device_of(servo_id=5)
     for command in REQUEST_SIZES:
         assert ask_device(device, command, b"\x2c\x01", to=0) is None
@@ -111,7 +111,7 @@ def test_a_restart_loses_unsaved_settings_and_is_silent_meanwhile() -> None:
 
 
 def test_settings_can_count_at_once() -> None:
-    """K5."""
+    """KST RS422, 3.1, 3.2: a change is in effect after save and restart."""
     device = device_of(immediate=True)
     assert ask_device(device, Command.SET_ID, b"\5") == frame_of(encode(FACTORY_ID, 0x48, b"\5"))
     assert device.node == 5
@@ -120,7 +120,7 @@ def test_settings_can_count_at_once() -> None:
 
 
 def test_a_save_that_is_answered() -> None:
-    """K4."""
+    """KST RS422, 3.3: a save needs no reply."""
     device = device_of()
     device.answers_save = True
     assert ask_device(device, Command.SAVE, b"save") == frame_of(encode(FACTORY_ID, 0x4F))

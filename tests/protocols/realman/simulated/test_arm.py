@@ -1,4 +1,4 @@
-"""The simulated arm: one bit for every failure, and a portrait of itself."""
+"""The simulated arm: one bit for every failure, and what it reports of itself."""
 
 from __future__ import annotations
 
