@@ -1,7 +1,7 @@
-"""Who may come in through a door, and as what: roles, and the YAML keys `access` and `door`.
+"""Who may use a daemon and in which role: the YAML keys `access` and `door`.
 
-A role can do what the roles before it can. Who is what on a Unix socket follows from the credentials the system gives of the
-other end; through TCP, from the token.
+A role may do what the roles below it may do. On the Unix socket the role follows from the user and groups of the client's process, as
+the kernel reports them; through TCP it follows from the token.
 """
 
 from __future__ import annotations
@@ -20,25 +20,22 @@ from servobus.values import Role
 
 __all__ = ["AccessOptions", "DoorOptions", "Role", "TcpOptions", "TlsOptions"]
 
-PATTERN = r"^@?[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?$"
-
-
-Who = Annotated[str, Field(pattern=PATTERN)]
-
-
-Users = Annotated[tuple[Who, ...], Field(strict=False)]
-"""YAML has lists."""
+UserOrGroup = Annotated[str, Field(pattern=r"^@?[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?$")]
+Users = Annotated[tuple[UserOrGroup, ...], Field(strict=False)]
+"""A YAML list."""
 
 
 class AccessOptions(Data):
-    """Users, or groups as `@name`. Nothing given: the owner of the daemon and root are admin, all others observer."""
+    """Roles of users and of groups (`@name`). With neither key, the daemon's owner and root are admin and all others observer."""
 
     admin: Users = ()
+    """Users and groups that may also change ids, baud rates, EEPROM registers and the config."""
     operator: Users = ()
+    """Users and groups that may move servos. All others may read, and stop."""
 
     @field_validator("admin", "operator")
     @classmethod
-    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             try:
                 grp.getgrnam(name[1:]) if name.startswith("@") else pwd.getpwnam(name)
@@ -48,7 +45,7 @@ class AccessOptions(Data):
         return names
 
     def role_of(self, uid: int, gid: int, *, owner: int) -> Role:
-        """Of a process with these credentials, at a daemon of this owner."""
+        """The role of a process with these ids, at a daemon whose owner has the user id `owner`."""
         if not (self.admin or self.operator):
             return Role.ADMIN if uid in (0, owner) else Role.OBSERVER
         for role, names in ((Role.ADMIN, self.admin), (Role.OPERATOR, self.operator)):
@@ -66,30 +63,32 @@ def _is_one_of(uid: int, gid: int, names: Sequence[str]) -> bool:
 def _groups(uid: int, gid: int) -> list[int]:
     try:
         return os.getgrouplist(pwd.getpwuid(uid).pw_name, gid)
-    except KeyError:  # a user without a name belongs to no group but that of its process
+    except KeyError:  # a user without a name is in the group of its process alone
         return []
 
 
 class TlsOptions(Data):
-    """PEM files."""
+    """The certificate of a TCP door."""
 
     certificate: Annotated[str, Field(min_length=1, max_length=4096)]
+    """Path of the certificate chain, a PEM file."""
     key: Annotated[str, Field(min_length=1, max_length=4096)]
+    """Path of the private key, a PEM file."""
 
 
 class TcpOptions(Data):
-    """The door on a network. Off unless the config has it."""
+    """The daemon's TCP port. Without this section there is none."""
 
     host: Annotated[str, Field(min_length=1, max_length=255)] = "127.0.0.1"
-    """An address of this machine."""
+    """Address of this machine to listen at. An address other than loopback needs `tls`."""
     port: Annotated[int, Field(ge=0, le=65535)]
-    """0: any free one, told in the log."""
+    """TCP port; 0 takes a free one, which the log names."""
     token_file: Annotated[str, Field(min_length=1, max_length=4096)]
-    """Holds the token that a client says first: at least 32 characters, readable for the owner alone (0600)."""
+    """Path of the file with the token that a client sends first: at least 32 characters, mode 0600."""
     role: Annotated[str, Field(pattern="^(observer|operator|admin)$")] = "operator"
-    """What the token makes of its bearer."""
+    """Role of the clients that send the token."""
     tls: TlsOptions | None = None
-    """Needed for every address but this machine's own."""
+    """Certificate and key for connections from other machines."""
 
     @property
     def loopback(self) -> bool:
@@ -103,19 +102,20 @@ class TcpOptions(Data):
     @model_validator(mode="after")
     def _safe(self) -> Self:
         if self.tls is None and not self.loopback:
-            raise ValueError(f"host {self.host} can be reached from outside: give tls, or keep to 127.0.0.1")
+            raise ValueError(f"host {self.host} can be reached from other machines: give tls, or use 127.0.0.1")
         return self
 
 
 class DoorOptions(Data):
-    """How much the daemon lets in. The defaults carry a robot and its tools."""
+    """Limits of the daemon's clients, and its TCP port. The defaults are enough for a robot and its tools."""
 
     tcp: TcpOptions | None = None
+    """A TCP port beside the Unix socket."""
     clients: Annotated[int, Field(ge=1, le=100_000)] = 1000
-    """Connections at once."""
+    """Highest number of connections."""
     clients_per_user: Annotated[int, Field(ge=1, le=100_000)] = 64
-    """Of one user, or through TCP of one address."""
+    """Highest number of connections of one user, or of one address through TCP."""
     rate: Annotated[float, Field(gt=0, le=1e6)] | None = 1000.0
-    """Requests/s of one client, over which it is read more slowly; null: no limit."""
+    """Requests/s of one client; a client that sends more is read more slowly. null: no limit."""
     lease_ms: Annotated[int, Field(ge=100, le=60_000)] = 500
-    """How long a client that moves servos may be silent before they do their `on_lost_client`."""
+    """Time in ms that a client with a motion lease may be silent; then its servos do their `on_lost_client`."""

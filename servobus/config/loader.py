@@ -1,12 +1,11 @@
-"""YAML bus configs: read within limits, checked whole, every mistake named by file, line and column.
+"""Reads a bus config: YAML within limits -> frozen options and models, or a ConfigError that lists every problem.
 
-What a key means stands in `protocols/options.py` and beside each protocol; what only a whole file shows stands here: two buses on
-one port, two servos with one id, limits that a model cannot reach.
+Each problem has a file, a line and a column. The options of `protocols` define the keys; `checks` has the rules that need several
+keys.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,15 +14,13 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter
 
 from servobus.config.access import AccessOptions, DoorOptions
+from servobus.config.checks import check_models, check_ports
 from servobus.documents import reader
 from servobus.documents.problems import Problems, quote, valid_subset
 from servobus.documents.reader import KeyPath
-from servobus.errors import ConfigError, ServobusError
-from servobus.links import TUNNELS, check_port
 from servobus.protocols.model import ServoModel
-from servobus.protocols.options import BusOptions, Name, ServoOptions
+from servobus.protocols.options import BusOptions, Name
 from servobus.protocols.registry import PROTOCOLS
-from servobus.simulation.link import SIMULATED, has_wire_time
 
 P = TypeVar("P", bound=BaseModel)
 VERSION = 1
@@ -34,7 +31,7 @@ _name = TypeAdapter(Name)
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """A whole rig."""
+    """The config of a whole rig."""
 
     version: int
     buses: Mapping[str, BusOptions]
@@ -49,71 +46,71 @@ class Config:
         return {f"{bus}/{servo}": (bus, servo) for bus, options in self.buses.items() for servo in options.servos}
 
     def has_same(self, bus: str, other: Config) -> bool:
-        """Nothing differs on this bus."""
+        """Whether both configs have this bus, with the same options and models."""
         if bus not in self.buses or bus not in other.buses:
             return False
         return self.buses[bus] == other.buses[bus] and self.models[bus] == other.models[bus]
 
 
 def load_config(path: str | Path) -> Config:
-    """The config in a file; model files are looked for beside it. Raises ConfigError."""
+    """Read the config in a file. Model files are relative to its folder. Raises ConfigError."""
     return _config(reader.read(path), Path(path).parent)
 
 
 def parse_config(text: str | bytes, name: str, folder: Path = Path()) -> Config:
-    """The config in a text; `name` stands in messages. Raises ConfigError."""
+    """Read the config in a text; messages call it `name`. Raises ConfigError."""
     return _config(reader.parse(text, name), folder)
 
 
 def _config(document: reader.Document, folder: Path) -> Config:
     problems = Problems(document)
+    data = _top_level(document.data, problems)
     buses: dict[str, BusOptions] = {}
     models: dict[str, Mapping[str, ServoModel]] = {}
-    for name, data in _bus_entries(document.data, problems):
-        options = _bus(name, data, problems)
+    for name, bus_data in _bus_items(data, problems):
+        options = _bus(name, bus_data, problems)
         if options is not None:
             buses[str(name)] = options
-            models[str(name)] = _models(("buses", name), options, folder, problems)
-    _check_ports(buses, problems)
-    data = document.data if isinstance(document.data, dict) else {}
-    access = _part(AccessOptions, "access", data, problems)
-    door = _part(DoorOptions, "door", data, problems)
+            models[str(name)] = check_models(("buses", name), options, folder, problems)
+    check_ports(buses, problems)
+    access = _section(AccessOptions, "access", data, problems)
+    door = _section(DoorOptions, "door", data, problems)
     problems.raise_any()
     return Config(VERSION, buses, models, access, door)
 
 
-def _part(kind: type[P], key: str, data: Mapping[Any, Any], problems: Problems) -> P:
-    """What the daemon's keys say; all of them may be left out."""
+def _section(kind: type[P], key: str, data: Mapping[Any, Any], problems: Problems) -> P:
+    """An optional section; its defaults where it is omitted or wrong."""
     return (problems.validated(kind, data[key], (key,)) if key in data else None) or kind()
 
 
-def _bus_entries(data: Any, problems: Problems) -> list[tuple[str | int, Any]]:
+def _top_level(data: Any, problems: Problems) -> Mapping[Any, Any]:
+    """Checks the keys of the file and its version; empty where the file is not a mapping."""
     if not isinstance(data, dict):
         problems.add((), f"found {quote(data)}; a config begins with `version: 1` and has `buses:`")
-        return []
+        return {}
     for key in data:
         if key not in KEYS:
             problems.add((key,), f"unknown key; there are {', '.join(KEYS)}", key=True)
-    if data.get("version") != VERSION or isinstance(data.get("version"), bool):
-        where: KeyPath = ("version",) if "version" in data else ()
-        problems.add(where, f"found version {quote(data.get('version'))}; write `version: {VERSION}`")
+    version = data.get("version")
+    if version != VERSION or isinstance(version, bool):
+        problems.add(("version",), f"found version {quote(version)}; write `version: {VERSION}`")
+    return data
+
+
+def _bus_items(data: Mapping[Any, Any], problems: Problems) -> list[tuple[str | int, Any]]:
     buses = data.get("buses")
-    if not isinstance(buses, dict) or not buses:
-        problems.add(("buses",) if "buses" in data else (), "no buses; name at least one under `buses:`")
-        return []
-    return list(buses.items())
+    if isinstance(buses, dict) and buses:
+        return list(buses.items())
+    if data:
+        problems.add(("buses",), "no buses; name at least one under `buses:`")
+    return []
 
 
 def _bus(name: str | int, data: Any, problems: Problems) -> BusOptions | None:
-    """The options of a bus; of a bus with mistakes, what else can be checked."""
+    """The options of a bus; of a bus with mistakes, the part that can be checked further."""
     path: KeyPath = ("buses", name)
-    if not isinstance(name, str):
-        problems.add(path, f"found {quote(name)} as a name; put it in quotes", key=True)
-        return None
-    try:
-        _name.validate_python(name)
-    except ValueError:
-        problems.add(path, "a name is letters, digits, . _ - and begins with a letter or digit", key=True)
+    if not _is_name(name, path, problems):
         return None
     if not isinstance(data, dict):
         problems.add(path, f"found {quote(data)}; a bus has the keys protocol, port, baudrate, servos")
@@ -128,87 +125,13 @@ def _bus(name: str | int, data: Any, problems: Problems) -> BusOptions | None:
     return options
 
 
-def _models(path: KeyPath, options: BusOptions, folder: Path, problems: Problems) -> Mapping[str, ServoModel]:
-    """The models of a bus, and what its servos want that those cannot do."""
-    found, refused = _find_models(options, folder)
-    owners: dict[Any, str] = {}
-    told: dict[str, str] = {}
-    for servo, entry in options.servos.items():
-        here = (*path, "servos", servo)
-        owner = owners.setdefault(entry.key, servo)
-        if owner != servo:
-            problems.add((*here, "id"), f"found id {entry.id} again (it is {owner}'s); each servo has its own")
-        if servo in refused:
-            first = told.setdefault(refused[servo], servo)
-            problems.add((*here, "model"), refused[servo] if first == servo else f"cannot be used, see {first}")
-        else:
-            _check_servo(here, entry, found[entry.model], problems)
-    return found
-
-
-def _find_models(options: BusOptions, folder: Path) -> tuple[dict[str, ServoModel], dict[str, str]]:
-    """The models by name, and by servo what was refused: when all together are not accepted, each alone is asked for."""
-    models = PROTOCOLS[options.protocol].models
-    found: dict[str, ServoModel] = {}
-    refused: dict[str, str] = {}
+def _is_name(name: str | int, path: KeyPath, problems: Problems) -> bool:
+    if not isinstance(name, str):
+        problems.add(path, f"found {quote(name)} as a name; put it in quotes", key=True)
+        return False
     try:
-        return dict(models(options, folder)), refused
-    except ConfigError:
-        for servo, entry in options.servos.items():
-            try:
-                found.update(models(options.model_copy(update={"servos": {servo: entry}}), folder))
-            except ConfigError as error:
-                refused[servo] = error.message
-    return found, refused
-
-
-def _check_servo(here: KeyPath, servo: ServoOptions, model: ServoModel, problems: Problems) -> None:
-    """What this model cannot do, or the wire cannot carry."""
-    if servo.unit is not None and servo.unit not in model.units:
-        problems.add((*here, "unit"), f"found {quote(servo.unit)}; model {model.name} has {', '.join(model.units)}")
-        return
-    calibration = servo.calibration(model)
-    ranges = model.goal_ranges
-    if "position" in ranges:
-        ends = sorted(calibration.to_unit(raw) for raw in ranges["position"])
-        for key, values in (("limits", servo.limits or ()), ("park_pose", [servo.park_pose])):
-            for value in values:
-                if value is not None and not ends[0] <= value <= ends[1]:
-                    problems.add((*here, key), f"found {value:g}; model {model.name} reaches {ends[0]:g} to {ends[1]:g}")
-    greatest = {
-        "speed": abs(calibration.rate_to_unit(ranges["speed"][1])) if "speed" in ranges else None,
-        "max_speed": abs(calibration.rate_to_unit(ranges["speed"][1])) if "speed" in ranges else None,
-        "acceleration": ranges["acceleration"][1] * calibration.unit_per_step if "acceleration" in ranges else None,
-        "torque_limit": ranges["torque_limit"][1] if "torque_limit" in ranges else None,
-    }
-    for key, most in greatest.items():
-        value = getattr(servo, key)
-        if value is not None and most is not None and value > most:
-            told = f"model {model.name} takes at most {most:g}" if most else f"model {model.name} has none"
-            problems.add((*here, key), f"found {value:g}; {told}")
-
-
-def _check_tunnel(options: BusOptions) -> None:
-    scheme = options.port.partition(":")[0]
-    passes = TUNNELS.get(scheme, options.protocol)
-    if passes != options.protocol:
-        raise ConfigError(f"{scheme}:// passes {passes} on and nothing else; {options.protocol} needs a line of its own")
-
-
-def _check_ports(buses: Mapping[str, BusOptions], problems: Problems) -> None:
-    """Each line has one owner, by whatever name it goes."""
-    owners: dict[str, str] = {}
-    for name, options in buses.items():
-        path: KeyPath = ("buses", name, "port")
-        try:
-            if options.port.startswith(SIMULATED):
-                has_wire_time(options.port)
-                continue
-            check_port(options.port)
-            _check_tunnel(options)
-        except ServobusError as error:
-            problems.add(path, error.message.replace(repr(options.port), quote(options.port)))
-            continue
-        owner = owners.setdefault(os.path.realpath(options.port), name)
-        if owner != name:
-            problems.add(path, f"found the port of bus {owner} again; put its servos into one bus, a line has one owner")
+        _name.validate_python(name)
+    except ValueError:
+        problems.add(path, "a name is letters, digits, . _ - and begins with a letter or digit", key=True)
+        return False
+    return True

@@ -1,7 +1,7 @@
-"""What is wrong in a file, each problem at its place: `file:line:column: key.path: what was found; what was expected`.
+"""The list of problems found in a document, each as `file:line:column: key.path: what was found; what was expected`.
 
-pydantic says what does not fit; the YAML document says where that stands. All problems of a file are told at once, the first in
-the file first, and none repeats more of the input than a few words.
+pydantic finds the mistakes, and the document has the line and column of each. All problems of a file are reported at once, in the
+order of the file, and none of them repeats more than a few characters of it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any, TypeAlias
 
 from pydantic import BaseModel, ValidationError
 
-from servobus.documents.reader import Document, KeyPath, Place, clip
+from servobus.documents.reader import Document, KeyPath, Mark, clip
 from servobus.errors import ConfigError
 
-Entry: TypeAlias = Mapping[str, Any]
-"""What pydantic says of one mistake: type, loc, msg, input, ctx."""
-MOST = 20
-"""Problems that are told; a file with more is some other file."""
-EXPECTED = {
+Mistake: TypeAlias = Mapping[str, Any]
+"""pydantic's description of one mistake: type, loc, msg, input, ctx."""
+MAX_REPORTED = 20
+"""Lines of problems; a file with more mistakes is probably no config at all."""
+WORDING = {
     "Input should be a valid tuple": "expected a list",
     "Input should be ": "expected ",
     "String should have ": "expected ",
@@ -28,98 +28,98 @@ EXPECTED = {
         "expected a name of letters, digits, . _ - that begins with a letter or digit"
     ),
 }
-"""pydantic's words -> ours."""
+"""A part of pydantic's message -> our wording."""
 
 
 class Problems:
-    """Collects what is wrong in one document."""
+    """Collects the problems of one document."""
 
     def __init__(self, document: Document) -> None:
         self.document = document
-        self._found: dict[tuple[Place, str], None] = {}
+        self._problems: dict[tuple[Mark, str], None] = {}
 
     def add(self, path: KeyPath, message: str, *, key: bool = False) -> None:
-        """At a value, or at its key."""
-        place = self.document.place(path, key=key)
-        self._found[place, f"{dotted(path)}: {message}" if path else message] = None
+        """Add a problem of the value at `path`, or of its key."""
+        mark = self.document.mark(path, key=key)
+        self._problems[mark, f"{dotted(path)}: {message}" if path else message] = None
 
     def raise_any(self) -> None:
-        """Raises ConfigError when there are any."""
-        if not self._found:
+        """Raises ConfigError where there are problems."""
+        if not self._problems:
             return
-        told = [f"{self.document.name}:{line}:{column}: {message}" for ((line, column), message) in sorted(self._found)]
-        lines = "\n".join(told).splitlines()  # what is wrong in a model file has several
-        if len(lines) > MOST:
-            lines[MOST:] = [f"and {len(lines) - MOST} more; correct these first"]
+        problems = [f"{self.document.name}:{line}:{column}: {message}" for (line, column), message in sorted(self._problems)]
+        lines = "\n".join(problems).splitlines()  # the problems of a model file are several lines
+        if len(lines) > MAX_REPORTED:
+            lines[MAX_REPORTED:] = [f"and {len(lines) - MAX_REPORTED} more; correct these first"]
         raise ConfigError("\n".join(lines))
 
     def validated(self, kind: type[BaseModel], data: Any, path: KeyPath) -> Any:
-        """The model of this part of the document; None when it does not fit, and then it is said why."""
+        """The model of a part of the document; None where it does not fit, and then the problems are added."""
         try:
             return kind.model_validate(data)
         except ValidationError as error:
-            for entry in error.errors(include_url=False):
-                self._add_entry(kind, {**entry}, path)
+            for mistake in error.errors(include_url=False):
+                self._add_mistake(kind, {**mistake}, path)
         return None
 
-    def _add_entry(self, kind: type[BaseModel], entry: Entry, base: KeyPath) -> None:
-        loc = tuple(part for part in entry["loc"] if part != "[key]")
+    def _add_mistake(self, kind: type[BaseModel], mistake: Mistake, base: KeyPath) -> None:
+        loc = tuple(part for part in mistake["loc"] if part != "[key]")
         path = (*base, *loc)
-        rule = RULES.get(entry["type"])
+        rule = RULES.get(mistake["type"])
         if rule is not None:
-            rule(self, kind, entry, path)
+            rule(self, kind, mistake, path)
             return
-        message = entry["msg"]
-        for theirs, ours in EXPECTED.items():
+        message = mistake["msg"]
+        for theirs, ours in WORDING.items():
             message = message.replace(theirs, ours)
-        self.add(path, f"{_found(entry)}{message}", key=_is_section(entry) or entry["loc"][-1:] == ("[key]",))
+        self.add(path, f"{_finding(mistake)}{message}", key=_is_section(mistake) or mistake["loc"][-1:] == ("[key]",))
 
-    def _unknown_key(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
-        known = fields_at(kind, entry["loc"][:-1])
-        near = difflib.get_close_matches(str(path[-1]), known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+    def _unknown_key(self, kind: type[BaseModel], mistake: Mistake, path: KeyPath) -> None:
+        keys = fields_at(kind, mistake["loc"][:-1])
+        near = difflib.get_close_matches(str(path[-1]), keys, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(keys)}"
         self.add(path, f"unknown key; {hint}", key=True)
 
-    def _missing_key(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
+    def _missing_key(self, kind: type[BaseModel], mistake: Mistake, path: KeyPath) -> None:
         if isinstance(path[-1], int):
             self.add(path[:-1], f"found {path[-1]} of its values; write {path[-1] + 1} or more")
         else:
             self.add(path[:-1], f"the key {path[-1]} is missing; add it", key=True)
 
-    def _no_section(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
-        known = ", ".join(fields_at(kind, entry["loc"]))
-        self.add(path, f"found no keys here; there are {known}" if known else "found no keys here; write `{key: value}`")
+    def _not_a_section(self, kind: type[BaseModel], mistake: Mistake, path: KeyPath) -> None:
+        keys = ", ".join(fields_at(kind, mistake["loc"]))
+        self.add(path, f"found no keys here; there are {keys}" if keys else "found no keys here; write `{key: value}`")
 
-    def _wrong_number(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
-        found = entry["ctx"]
-        wanted = f"at most {found['max_length']}" if "max_length" in found else f"{found['min_length']} or more"
-        self.add(path, f"found {found['actual_length']} here; write {wanted}")
+    def _wrong_count(self, kind: type[BaseModel], mistake: Mistake, path: KeyPath) -> None:
+        context = mistake["ctx"]
+        expected = f"at most {context['max_length']}" if "max_length" in context else f"{context['min_length']} or more"
+        self.add(path, f"found {context['actual_length']} here; write {expected}")
 
-    def _no_text(self, kind: type[BaseModel], entry: Entry, path: KeyPath) -> None:
-        if entry["loc"][-1] == "[key]":
-            self.add(path, f"found {quote(entry['input'])} as a name; put it in quotes", key=True)
+    def _not_text(self, kind: type[BaseModel], mistake: Mistake, path: KeyPath) -> None:
+        if mistake["loc"][-1] == "[key]":
+            self.add(path, f"found {quote(mistake['input'])} as a name; put it in quotes", key=True)
         else:
-            self.add(path, f"{_found(entry)}expected text; a number stands in quotes", key=_is_section(entry))
+            self.add(path, f"{_finding(mistake)}expected text; put a number in quotes", key=_is_section(mistake))
 
 
-RULES: dict[str, Callable[[Problems, type[BaseModel], Entry, KeyPath], None]] = {
+RULES: dict[str, Callable[[Problems, type[BaseModel], Mistake, KeyPath], None]] = {
     "extra_forbidden": Problems._unknown_key,
     "missing": Problems._missing_key,
-    "model_type": Problems._no_section,
-    "dict_type": Problems._no_section,
-    "too_long": Problems._wrong_number,
-    "too_short": Problems._wrong_number,
-    "string_type": Problems._no_text,
+    "model_type": Problems._not_a_section,
+    "dict_type": Problems._not_a_section,
+    "too_long": Problems._wrong_count,
+    "too_short": Problems._wrong_count,
+    "string_type": Problems._not_text,
 }
+"""pydantic's type of mistake -> the method that adds it; any other keeps pydantic's message."""
 
 
 def valid_subset(kind: type[BaseModel], data: Mapping[Any, Any]) -> Any:
-    """The model of what is left when everything that does not fit is taken out, so that the rest can be looked at in the same
-    go; None when the rest does not stand alone."""
+    """The model of the data without its faulty parts, so that the other parts can be checked too; None where that fails."""
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        faulty = {entry["loc"][:2] for entry in error.errors(include_url=False, include_input=False)}
+        faulty = {mistake["loc"][:2] for mistake in error.errors(include_url=False, include_input=False)}
     rest = dict(data)
     for key, *below in filter(None, faulty):
         if below and isinstance(rest.get(key), Mapping):
@@ -132,32 +132,32 @@ def valid_subset(kind: type[BaseModel], data: Mapping[Any, Any]) -> Any:
         return None
 
 
-def _is_section(entry: Entry) -> bool:
-    return isinstance(entry["input"], (Mapping, list, tuple))
+def _is_section(mistake: Mistake) -> bool:
+    return isinstance(mistake["input"], (Mapping, list, tuple))
 
 
-def _found(entry: Entry) -> str:
-    """Nothing for a whole section: its place says enough."""
-    return "" if _is_section(entry) else f"found {quote(entry['input'])}; "
+def _finding(mistake: Mistake) -> str:
+    """Quotes the value; of a whole section the line and column are enough."""
+    return "" if _is_section(mistake) else f"found {quote(mistake['input'])}; "
 
 
 def fields_at(kind: type[BaseModel], loc: KeyPath) -> list[str]:
-    """The keys that are known at this place of a model; none where they are the user's own."""
+    """The keys of a model at this path; empty where the keys are the user's own."""
     for part in loc:
         field = kind.model_fields.get(str(part))
         if field is not None:
-            inner = _models_in(field.annotation)
+            inner = models_in(field.annotation)
             if not inner:
                 return []
             kind = inner[0]
     return list(kind.model_fields)
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """The models that an annotation holds: `dict[str, Servo]`, `Poll | None`."""
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models inside an annotation such as `dict[str, Servo]` or `Poll | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]
+    return [model for part in getattr(annotation, "__args__", ()) for model in models_in(part)]
 
 
 def dotted(path: KeyPath) -> str:
@@ -165,7 +165,7 @@ def dotted(path: KeyPath) -> str:
 
 
 def quote(value: Any) -> str:
-    """A value as it is written, cut to a few words."""
+    """A value as YAML writes it, cut to a few characters."""
     if value is None:
         return "nothing"
     return clip(str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, str) else str(value))

@@ -1,10 +1,12 @@
-"""YAML that people write and strangers may send: a safe subset, read within limits, with the place of every value.
+"""Reads a safe subset of YAML within limits, and keeps the line and column of every value.
 
-Everything the project reads from YAML goes through here, so that each problem can name `file:line:column`. Two rules hold for
-the file: what the text alone shows is refused before the parser sees it, because the parser's time and memory are not bounded
-by the text's length; and no more of the input than a few words ever stands in an error.
+The whole project reads YAML with this module, so each problem can name `file:line:column`. The text may come from an attacker:
 
-Scalars follow the core schema of YAML 1.2 (`on` and `yes` are text), except that `010` is refused: YAML 1.1 read it as eight.
+- A linear scan of the text runs before the parser, because the length of a text does not bound the parser's time and memory.
+- The parser's events are counted as they come, and the first one that a config cannot contain ends the reading.
+- An error repeats at most a few characters of the text.
+
+Scalars follow the core schema of YAML 1.2 (`on` and `yes` are text). `010` is refused, because YAML 1.1 reads it as eight.
 """
 
 from __future__ import annotations
@@ -35,18 +37,18 @@ from servobus.errors import ConfigError
 MAX_BYTES = 64 * 1024
 MAX_DEPTH = 16
 MAX_NODES = 5000
-"""Keys and values. The parser needs about 15 us for each, so this and not the size bounds its time."""
+"""Keys and values. The parser takes about 15 us for each, so this limit bounds its time."""
 MAX_INTEGER = (1 << 63) - 1
 MAX_SHOWN = 60
-"""Characters of the input that an error may repeat."""
+"""Characters of the text that an error may repeat."""
 
 KeyPath: TypeAlias = tuple[str | int, ...]
-Place: TypeAlias = tuple[int, int]
-"""Line and column, from 1."""
+Mark: TypeAlias = tuple[int, int]
+"""Line and column, counted from 1."""
 
 FORBIDDEN = re.compile(r"[^\n\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]")
-"""Tabs, byte-order marks, control characters, surrogates, and marks that turn the direction of writing."""
-FORBIDDEN_WORDS = {
+"""Tabs, byte-order marks, control characters, surrogates, and characters that change the direction of writing."""
+FORBIDDEN_HINTS = {
     "\t": "found a tab; use spaces",
     "\ufeff": "found a byte-order mark; save the file as UTF-8 without one",
 }
@@ -60,7 +62,7 @@ UNREADABLE: dict[type[Exception], str] = {
     IsADirectoryError: "this is a directory; name a YAML file in it",
     PermissionError: "this user may not read it; check its owner and mode",
 }
-WORDS = dict.fromkeys(("", "~", "null", "Null", "NULL"), None) | {
+CONSTANTS = dict.fromkeys(("", "~", "null", "Null", "NULL"), None) | {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
@@ -72,27 +74,22 @@ NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Plain data, and where each part of it stands."""
+    """The data of a YAML text, and the line and column of each part of it."""
 
     data: Any
     name: str
-    places: dict[KeyPath, tuple[Place, Place]] = field(repr=False)
-    """Path -> where its key and where its value begins (the same for a list item)."""
+    marks: dict[KeyPath, tuple[Mark, Mark]] = field(repr=False)
+    """Path -> the starts of its key and of its value; the two are equal for an item of a list."""
 
-    def place(self, path: KeyPath, *, key: bool = False) -> Place:
-        """Line and column of a value, or of its key; of the nearest known ancestor's key where there is none."""
-        while path not in self.places:
+    def mark(self, path: KeyPath, *, key: bool = False) -> Mark:
+        """The start of a value, or of its key. Where the path does not exist, the start of the key nearest above it."""
+        while path not in self.marks:
             path, key = path[:-1], True
-        return self.places[path][0 if key else 1]
-
-    def where(self, path: KeyPath, *, key: bool = False) -> str:
-        """The same as `name:line:column`."""
-        line, column = self.place(path, key=key)
-        return f"{self.name}:{line}:{column}"
+        return self.marks[path][0 if key else 1]
 
 
 def read(path: Path | str) -> Document:
-    """The document in a file. Raises ConfigError, also for what the system says of the file."""
+    """Read a file. Raises ConfigError, also where the file cannot be opened."""
     name = clip(str(path), 200)
     try:
         with open(path, "rb") as file:
@@ -104,7 +101,7 @@ def read(path: Path | str) -> Document:
 
 
 def parse(text: str | bytes, name: str) -> Document:
-    """The document in a text. Raises ConfigError with `name:line:column`, what was found and what to do."""
+    """Read a text; messages call it `name`. Raises ConfigError with `name:line:column`, the finding and the next step."""
     name = clip(name, 200)
     text = _decode(text, name)
     _scan(text, name)
@@ -114,20 +111,20 @@ def parse(text: str | bytes, name: str) -> Document:
 
 
 def clip(text: str, length: int = MAX_SHOWN) -> str:
-    """At most so much of a text, on one line, fit to be shown."""
+    """The text cut to a length, with unprintable characters replaced, for a message."""
     text = "".join(char if char.isprintable() else "?" for char in text[: length + 1])
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
-def _fail(name: str, place: Place, message: str) -> NoReturn:
-    raise ConfigError(f"{name}:{place[0]}:{place[1]}: {message}")
+def _fail(name: str, mark: Mark, message: str) -> NoReturn:
+    raise ConfigError(f"{name}:{mark[0]}:{mark[1]}: {message}")
 
 
-def _place_of(text: str, index: int) -> Place:
+def _mark_at(text: str, index: int) -> Mark:
     return text.count("\n", 0, index) + 1, index - (text.rfind("\n", 0, index) + 1) + 1
 
 
-def _start(event: Event) -> Place:
+def _start(event: Event) -> Mark:
     return event.start_mark.line + 1, event.start_mark.column + 1
 
 
@@ -135,7 +132,7 @@ def _start(event: Event) -> Place:
 
 
 def _decode(text: str | bytes, name: str) -> str:
-    """Text of bounded size, with Unix line ends."""
+    """Returns text of bounded size, with Unix line ends."""
     if len(text) > MAX_BYTES or (isinstance(text, str) and len(text.encode(errors="surrogatepass")) > MAX_BYTES):
         _fail(name, (1, 1), f"found more than {MAX_BYTES} bytes; split the file, a config needs a few thousand")
     if isinstance(text, str):
@@ -145,69 +142,71 @@ def _decode(text: str | bytes, name: str) -> str:
     except UnicodeDecodeError as error:
         valid = text[: error.start].decode()
         message = f"found byte 0x{text[error.start]:02X}, which is not UTF-8; save the file as UTF-8"
-        _fail(name, _place_of(valid, len(valid)), message)
+        _fail(name, _mark_at(valid, len(valid)), message)
 
 
 def _scan(text: str, name: str) -> None:
-    """Refuse what the text alone shows."""
-    if found := FORBIDDEN.search(text):
-        _fail(name, _place_of(text, found.start()), _forbidden(found[0]))
+    """Refuses characters, directives, documents and nesting that the text alone shows."""
+    if match := FORBIDDEN.search(text):
+        _fail(name, _mark_at(text, match.start()), _forbidden(match[0]))
     start = BEFORE_DOCUMENT.match(text)
     for marker in MARKER.finditer(text):
-        place = _place_of(text, marker.start())
+        mark = _mark_at(text, marker.start())
         if marker[0] == "%":
-            _fail(name, place, "found a YAML directive (%); take the line out")
+            _fail(name, mark, "found a YAML directive (%); take the line out")
         if marker[0] == "..." or (start and marker.start() != start.end()):
-            _fail(name, place, f"found {marker[0]}, the border of a second document; put each in a file of its own")
+            _fail(name, mark, f"found {marker[0]}, the border of a second document; put each in a file of its own")
     _scan_brackets(text, name)
 
 
 def _forbidden(char: str) -> str:
-    return FORBIDDEN_WORDS.get(char) or f"found the control character U+{ord(char):04X}; take it out"
+    return FORBIDDEN_HINTS.get(char) or f"found the control character U+{ord(char):04X}; take it out"
 
 
 def _scan_brackets(text: str, name: str) -> None:
-    """The parser looks ahead through a line of open brackets in quadratic time. Brackets inside quotes count too: that errs on
-    the safe side, and seventeen of them left open are no part of a config. Indented nesting is counted as it is parsed."""
+    """Refuses deep nesting of brackets, because the parser takes quadratic time for it.
+
+    Brackets inside quotes count too: no config leaves seventeen of them open. `_Builder` counts indented nesting.
+    """
     depth = 0
     for bracket in BRACKET.finditer(text):
         depth = depth + 1 if bracket[0] in "[{" else max(0, depth - 1)
         if depth > MAX_DEPTH:
-            _fail(name, _place_of(text, bracket.start()), TOO_DEEP)
+            _fail(name, _mark_at(text, bracket.start()), TOO_DEEP)
 
 
-# The parser's events made into data
+# The parser's events become data
 
 
 class _Builder:
-    """Turns events into data, and stops at the first one that has no place in a config."""
+    """Makes data from the parser's events, and refuses the first event that a config cannot contain."""
 
     def __init__(self, name: str, events: Generator[Any, None, None]) -> None:
         self.name = name
         self.events = events
-        self.places: dict[KeyPath, tuple[Place, Place]] = {}
+        self.marks: dict[KeyPath, tuple[Mark, Mark]] = {}
         self.nodes = 0
-        self.last: Place = (1, 1)
+        self.last: Mark = (1, 1)
 
     def document(self) -> Document:
-        self.places[()] = ((1, 1), (1, 1))
+        self.marks[()] = ((1, 1), (1, 1))
         data = None
         while (event := self._next()) is not None:
             if isinstance(event, NodeEvent):
                 data = self._node(event, (), 1)
-        return Document(data, self.name, self.places)
+        return Document(data, self.name, self.marks)
 
     def _next(self) -> Event | None:
-        """The next event; the parser's own problems in our words."""
+        """The next event. Raises ConfigError for an error of the parser."""
         try:
             event: Event | None = next(self.events, None)
         except MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
-            place = (mark.line + 1, mark.column + 1) if mark else self.last
+            start = (mark.line + 1, mark.column + 1) if mark else self.last
             problem = clip(str(error.problem or error.context), 100)
-            _fail(self.name, place, f"this is not YAML: {problem}; check colons, quotes, brackets and indentation here")
+            _fail(self.name, start, f"this is not YAML: {problem}; check colons, quotes, brackets and indentation here")
         except (YAMLError, ValueError, OverflowError):
-            _fail(self.name, self.last, "behind this something is not YAML; check escapes in double quotes")
+            _fail(self.name, self.last, "the text after this point is not YAML; check escapes in double quotes")
         if event is not None:
             self.last = _start(event)
         return event
@@ -233,7 +232,7 @@ class _Builder:
         if event.anchor is not None:
             self._refuse(event, "found an anchor (&name); take it out and write the value where it is needed")
         if event.tag is not None:
-            self._refuse(event, "found a tag (!name); take it out, values have no types but their own")
+            self._refuse(event, "found a tag (!name); take it out, a value shows its type itself")
         if isinstance(event, CollectionStartEvent) and depth > MAX_DEPTH:
             self._refuse(event, TOO_DEEP)
 
@@ -241,7 +240,7 @@ class _Builder:
         items: list[Any] = []
         while (event := self._next()) is not None and not isinstance(event, SequenceEndEvent):
             here = (*path, len(items))
-            self.places[here] = (_start(event), _start(event))
+            self.marks[here] = (_start(event), _start(event))
             items.append(self._node(event, here, depth + 1))
         return items
 
@@ -252,11 +251,11 @@ class _Builder:
             key = self._key(event)
             here = (*path, key)
             if key in data:
-                first = self.places[here][0][0]
+                first = self.marks[here][0][0]
                 self._refuse(event, f"found the key {clip(str(key))} again (first on line {first}); keep one of them")
             value = self._next()
             assert value is not None, "a key's event is followed by its value's"
-            self.places[here] = (_start(event), _start(value))
+            self.marks[here] = (_start(event), _start(value))
             data[key] = self._node(value, here, depth + 1)
         return data
 
@@ -273,11 +272,11 @@ class _Builder:
     def _scalar(self, event: ScalarEvent) -> Any:
         text: str = event.value
         if event.style is not None:
-            if found := FORBIDDEN.search(text):
-                self._refuse(event, f"in this text {_forbidden(found[0])}")
+            if match := FORBIDDEN.search(text):
+                self._refuse(event, f"in this text {_forbidden(match[0])}")
             return text
-        if text in WORDS:
-            return WORDS[text]
+        if text in CONSTANTS:
+            return CONSTANTS[text]
         if INTEGER.fullmatch(text):
             return self._integer(event, text)
         if NOT_FINITE.fullmatch(text) or (FLOAT.fullmatch(text) and not math.isfinite(float(text))):

@@ -65,7 +65,7 @@ MISTAKES = {
     "limits that are no list": Mistake("[-90, 90]", "90", 9, 45, "found 90; expected a list"),
     "number as a name": Mistake("elbow:", "7:", 10, 7, "found 7 as a name; put it in quotes"),
     "number as a bus": Mistake("  arm:", "  7:", 3, 3, "buses.7: found 7 as a name; put it in quotes"),
-    "number as a port": Mistake('"sim:"', "7", 5, 11, "found 7; expected text; a number stands in quotes"),
+    "number as a port": Mistake('"sim:"', "7", 5, 11, "found 7; expected text; put a number in quotes"),
     "list as a port": Mistake('"sim:"', "[a]", 5, 5, "buses.arm.port: expected text"),
     "bad address": Mistake('port: "sim:"', "port: tcp://nowhere", 5, 11, "tcp://HOST:PORT"),
 }

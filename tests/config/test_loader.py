@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from servobus.config.loader import load_config, parse_config
-from servobus.documents.problems import MOST
+from servobus.documents.problems import MAX_REPORTED
 from servobus.errors import ConfigError
 from servobus.protocols.sms.options import SmsBus
 from tests.config.mistakes import GOOD, MISTAKES, Mistake
@@ -77,8 +77,8 @@ def test_a_mistake_of_a_bus_hides_no_mistake_of_the_next() -> None:
 def test_only_the_first_of_many_mistakes_are_reported() -> None:
     text = "version: 1\nbuses:\n" + "".join(f"  b{number}: 7\n" for number in range(100))
     lines = problem(text).splitlines()
-    assert len(lines) == MOST + 1
-    assert lines[-1] == f"and {100 - MOST} more; correct these first"
+    assert len(lines) == MAX_REPORTED + 1
+    assert lines[-1] == f"and {100 - MAX_REPORTED} more; correct these first"
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_lines_are_counted_when_many_models_are_wrong(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text(GOOD.replace("model: sts", "model: mine.yaml"))
     with pytest.raises(ConfigError) as caught:
         load_config(tmp_path / "rig.yaml")
-    assert len(str(caught.value).splitlines()) == MOST + 1
+    assert len(str(caught.value).splitlines()) == MAX_REPORTED + 1
 
 
 # Files

@@ -194,7 +194,7 @@ def test_a_token_file_that_is_missing_or_a_link(tmp_path: Path) -> None:
 def test_nothing_is_open_to_the_network_without_tls(host: str) -> None:
     bus = "buses: {a: {protocol: sms, port: 'sim:', baudrate: 9600}}"
     text = f"version: 1\n{bus}\ndoor: {{tcp: {{host: '{host}', port: 1, token_file: t}}}}\n"
-    with pytest.raises(ConfigError, match=r"c:3:8: door\.tcp: .*can be reached from outside: give tls"):
+    with pytest.raises(ConfigError, match=r"c:3:8: door\.tcp: .*can be reached from other machines: give tls"):
         parse_config(text, "c")
     with pytest.raises(ConfigError, match="token_file"):
         parse_config(text.replace(", token_file: t", ""), "c")

@@ -38,15 +38,15 @@ def test_scalars(text: str, value: object) -> None:
     assert (parsed, type(parsed)) == (value, type(value))
 
 
-def test_places() -> None:
+def test_lines_and_columns() -> None:
     document = parse("a:\n  b: [1, 2]\n  c: {d: x}\n", "f.yaml")
     assert document.data == {"a": {"b": [1, 2], "c": {"d": "x"}}}
-    assert document.where(("a",), key=True) == "f.yaml:1:1"
-    assert document.where(("a", "b")) == "f.yaml:2:6"
-    assert document.where(("a", "b", 1)) == "f.yaml:2:10"
-    assert document.where(("a", "c", "d")) == "f.yaml:3:10"
-    assert document.where(("a", "c", "nowhere")) == "f.yaml:3:3", "the nearest key above"
-    assert document.where(("nowhere",)) == "f.yaml:1:1"
+    assert document.mark(("a",), key=True) == (1, 1)
+    assert document.mark(("a", "b")) == (2, 6)
+    assert document.mark(("a", "b", 1)) == (2, 10)
+    assert document.mark(("a", "c", "d")) == (3, 10)
+    assert document.mark(("a", "c", "nowhere")) == (3, 3), "the nearest key above"
+    assert document.mark(("nowhere",)) == (1, 1)
 
 
 def test_windows_line_ends_and_a_first_marker() -> None:

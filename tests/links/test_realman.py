@@ -209,5 +209,5 @@ def test_ports_that_cannot_be_read(port: str) -> None:
 
 def test_only_modbus_passes_through_an_arm() -> None:
     text = "version: 1\nbuses: {arm: {protocol: sms, port: 'realman://h:1', baudrate: 9600, servos: {s: {id: 1, model: sts}}}}\n"
-    with pytest.raises(ConfigError, match=r"arm:2:36: .*realman:// passes roh on and nothing else"):
+    with pytest.raises(ConfigError, match=r"arm:2:36: .*realman:// carries roh alone"):
         parse_config(text, "arm")
