@@ -1,5 +1,5 @@
-"""As much of JSON Schema as the config's schema needs: whether an editor would accept some data. A keyword that it does not know
-is an error, so that none is passed over in silence."""
+"""The part of JSON Schema that the config's schema needs: decides whether an editor would accept some data. A keyword that it does
+not know is an error, so that no keyword is ignored."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ KINDS: dict[str, tuple[type, ...]] = {
     "array": (list,),
     "object": (dict,),
 }
-SAID = {"$schema", "$defs", "title", "description", "default", "discriminator"}
+ANNOTATIONS = {"$schema", "$defs", "title", "description", "default", "discriminator"}
 """Keywords that refuse nothing."""
 
 
 def accepts(schema: Mapping[str, Any], data: Any, definitions: Mapping[str, Any]) -> bool:
-    """Whether the data fits."""
-    return all(keyword in SAID or RULES[keyword](schema, data, definitions) for keyword in schema)
+    """Return whether the data fits."""
+    return all(keyword in ANNOTATIONS or RULES[keyword](schema, data, definitions) for keyword in schema)
 
 
 def _kind(schema: Mapping[str, Any], data: Any, definitions: Mapping[str, Any]) -> bool:

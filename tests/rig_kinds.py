@@ -1,4 +1,4 @@
-"""The same rig as its owner has it and through a daemon."""
+"""The kinds of rig that a contract is tested with: one that owns its ports, and one of a daemon."""
 
 from __future__ import annotations
 

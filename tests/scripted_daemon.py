@@ -1,4 +1,4 @@
-"""A daemon that says what a test tells it, on a real Unix socket: for what a real one would never say."""
+"""A daemon that answers as a test scripts it, on a real Unix socket: for answers that a real daemon never gives."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class Visitor(asyncio.Protocol):
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             message = json.loads(line)
-            self.daemon.heard.append((message["method"], message["params"]))
-            answer = self.daemon.answers.get(message["method"], NOT_FOUND)
+            self.daemon.received.append((message["method"], message["params"]))
+            answer = self.daemon.answers.get(message["method"], UNKNOWN_METHOD)
             result = answer(self, message) if callable(answer) else answer
             if result is not None and "id" in message:
                 self.say({"id": message["id"], **(result if "error" in result else {"result": result["result"]})})
@@ -66,7 +66,7 @@ class Visitor(asyncio.Protocol):
             self.say({"method": method, "params": {"subscription": number, "missed": 0, **params}})
 
 
-NOT_FOUND = {"error": {"code": -32601, "message": "method not found"}}
+UNKNOWN_METHOD = {"error": {"code": -32601, "message": "method not found"}}
 
 
 def failed(kind: str, message: str, **data: Any) -> dict[str, Any]:
@@ -86,7 +86,7 @@ class PuppetDaemon:
     """Once it serves."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[str, dict[str, Any]]] = []
+        self.received: list[tuple[str, dict[str, Any]]] = []
         self.visitors: list[Visitor] = []
         self.subscribed = 0
         self.answers: dict[str, Any] = {
@@ -108,7 +108,7 @@ class PuppetDaemon:
 
     def calls(self, method: str) -> list[dict[str, Any]]:
         """The parameters of each."""
-        return [params for name, params in self.heard if name == method]
+        return [params for name, params in self.received if name == method]
 
 
 @asynccontextmanager

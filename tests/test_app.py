@@ -47,25 +47,25 @@ async def test_one_app_for_every_joint(protocol: str) -> None:
 
 
 @virtual
-async def test_a_led_servo_keeps_its_speed_and_stops_where_it_is() -> None:
+async def test_the_host_keeps_the_speed_and_stops_a_servo_without_speed() -> None:
     text = f"version: 1\nbuses:\n  line:\n    port: 'sim:'\n    goal_rate: 100\n    poll: {{feedback: 100}}\n{JOINTS['kst']}"
     async with open_rig(parse_config(text, "app")) as rig:
         joint = rig["joint"]
         await joint.enable()
         await joint.move_to(45, speed=30)
-        places: list[float] = []
+        positions: list[float] = []
         async for snapshot in rig.watch(hz=20):
             position = snapshot["line/joint"].position
             assert position is not None
-            places.append(position)
-            if len(places) == 21:
+            positions.append(position)
+            if len(positions) == 21:
                 break
-        assert places[-1] - places[0] == pytest.approx(30, abs=2), "one second at 30 degrees/s"
+        assert positions[-1] - positions[0] == pytest.approx(30, abs=2), "one second at 30 degrees/s"
         await rig.stop()
         stopped = (await joint.read()).position
         await rig.clear()
         async for snapshot in rig.watch(hz=2):
-            if len(places) == 23:
+            if len(positions) == 23:
                 break
-            places.append(snapshot["line/joint"].position or 0.0)
-        assert places[-1] == stopped, "nobody leads it any further"
+            positions.append(snapshot["line/joint"].position or 0.0)
+        assert positions[-1] == stopped, "no setpoint is sent any more"

@@ -19,8 +19,8 @@ from tests.virtual_time import virtual
 
 @dataclass(frozen=True)
 class Delivery:
-    """What the line does to replies. `lossy`: a verb may end in a typed error. `patience`: seconds that an answer may take on a
-    machine that has no time for us, beyond the usual; 0 where answers are lost (some drown in noise too)."""
+    """What the line does to replies. `lossy`: a verb may end in a typed error. `patience`: more seconds that a reply may take on a
+    busy machine; 0 where replies are lost."""
 
     faults: str
     lossy: bool = False
@@ -41,13 +41,13 @@ MATRIX = {
 Verb = tuple[Callable[[LocalRig], Awaitable[object]], Callable[[Any], bool]]
 VERBS: dict[str, Verb] = {
     "ping": (lambda rig: rig.ping("s1"), lambda status: status == 0),
-    "identify": (lambda rig: rig.identify("s2"), lambda found: getattr(found, "model", None) == "sts"),
+    "identify": (lambda rig: rig.identify("s2"), lambda result: getattr(result, "model", None) == "sts"),
     "read": (lambda rig: rig.read("s1"), lambda state: abs(getattr(state, "position", 99)) < 0.1),
     "read_register": (lambda rig: rig.read_register("s2", "id"), lambda value: value == 2),
     "read_span": (lambda rig: rig.read_register("s3", "5:1"), lambda value: value == [3]),
     "write_register": (lambda rig: rig.write_register("s2", "torque_limit", 50), lambda value: value == 50),
     "persist": (lambda rig: rig.write_register("s3", "return_delay", 100, raw=True, persist=True), lambda value: value == 100),
-    "scan": (lambda rig: rig.scan("arm", ids=range(5)), lambda found: [hit.id for hit in found] == [1, 2, 3]),
+    "scan": (lambda rig: rig.scan("arm", ids=range(5)), lambda result: [hit.id for hit in result] == [1, 2, 3]),
     "enable": (lambda rig: rig.enable(), lambda done: done is None),
     "write": (lambda rig: rig["s1"].move_to(10), lambda outcome: outcome is Outcome.ACKED),
     "sync_write": (
@@ -71,9 +71,9 @@ VERBS: dict[str, Verb] = {
 KST_VERBS: dict[str, Verb] = {
     **{name: VERBS[name] for name in ("read", "write", "settle", "stop", "clear")},
     "ping": (lambda rig: rig.ping("s1"), lambda status: status is None),
-    "identify": (lambda rig: rig.identify("s2"), lambda found: (found.model, found.firmware) == ("kst", "1.00")),
+    "identify": (lambda rig: rig.identify("s2"), lambda result: (result.model, result.firmware) == ("kst", "1.00")),
     "read_register": (lambda rig: rig.read_register("s2", "id"), lambda value: value == 2),
-    "scan": (lambda rig: rig.scan("arm", ids=range(1, 5)), lambda found: [hit.id for hit in found] == [1, 2, 3]),
+    "scan": (lambda rig: rig.scan("arm", ids=range(1, 5)), lambda result: [hit.id for hit in result] == [1, 2, 3]),
     "enable": VERBS["enable"],
     "sync_write": (lambda rig: rig.move({"s1": 5, "s2": -5}), lambda results: set(results.values()) == {Outcome.ACKED}),
     "reg_write": VERBS["reg_write"],
@@ -95,13 +95,13 @@ KST_ORDER = (
 KST_SERVOS = ("s1: {id: 1, limits: [-80, 80]}", "s2: {id: 2}", "s3: {id: 3}")
 ROH_VERBS: dict[str, Verb] = {
     "ping": (lambda rig: rig.ping("s1"), lambda status: status is None),
-    "identify": (lambda rig: rig.identify("s2"), lambda found: (found.model, found.firmware) == ("v2", "3.1.155")),
+    "identify": (lambda rig: rig.identify("s2"), lambda result: (result.model, result.firmware) == ("v2", "3.1.155")),
     "read": (lambda rig: rig.read("s1"), lambda state: state.position == 0),
     "read_register": (lambda rig: rig.read_register("s2", "node_id"), lambda value: value == 2),
     "read_span": (lambda rig: rig.read_register("s3", "1005:1"), lambda value: value == [2]),
     "write_register": (lambda rig: rig.write_register("s2", "stall_speed", 20), lambda value: value == 20),
     "persist": (lambda rig: rig.write_register("s3", "beep_switch", 0, persist=True), lambda value: value == 0),
-    "scan": (lambda rig: rig.scan("arm", ids=range(1, 4)), lambda found: [hit.id for hit in found] == [2]),
+    "scan": (lambda rig: rig.scan("arm", ids=range(1, 4)), lambda result: [hit.id for hit in result] == [2]),
     "enable": VERBS["enable"],
     "write": VERBS["write"],
     "sync_write": (lambda rig: rig.move({"s1": 45, "s2": 55}), lambda results: set(results.values()) == {Outcome.ACKED}),
@@ -120,11 +120,11 @@ ROH_SERVOS = ("s1: {id: 2, channel: index}", "s2: {id: 2, channel: middle}", "s3
 PROTOCOLS = {"sms": VERBS, "kst": {name: KST_VERBS[name] for name in KST_ORDER}, "roh": ROH_VERBS}
 
 LOSSY: dict[str, Callable[[Any], bool]] = {
-    "scan": lambda found: {hit.id for hit in found} <= {1, 2, 3},
+    "scan": lambda result: {hit.id for hit in result} <= {1, 2, 3},
     "sync_write": lambda results: set(results.values()) <= {Outcome.SENT, Outcome.ACKED},
     "settle": lambda states: all(not state.moving for state in states.values()),
 }
-"""What is right all the same where replies are lost: ids not found, goals that leave one by one, an older goal reached."""
+"""Results that are right too where replies are lost: missing ids, goals that leave one by one, an older goal reached."""
 
 
 def _config(protocol: str, delivery: Delivery) -> Config:

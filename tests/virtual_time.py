@@ -1,6 +1,6 @@
-"""An event loop whose time stands still while anything is to be done, and leaps to the next timer when nothing is.
+"""An event loop in virtual time: its clock stands while anything can run, and jumps to the next timer when nothing can.
 
-For whatever measures time in the loop's own: waits of hours cost nothing, and figures are exact.
+A test of hours takes a moment, and its figures are exact.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ P = ParamSpec("P")
 
 
 class _Leap(selectors.SelectSelector):
-    """Does not wait, but says how long it would have."""
+    """Does not wait; moves the clock by the time that it would have waited."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,7 +23,7 @@ class _Leap(selectors.SelectSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout is None:
-            raise RuntimeError("everything waits, and no timer is set: this would wait for ever")
+            raise RuntimeError("everything waits and no timer is set: this would wait for ever")
         ready = super().select(0)
         if not ready:
             self.now += timeout
@@ -44,7 +44,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def virtual(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """A test that runs in virtual time."""
+    """Run a coroutine test in virtual time."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:

@@ -1,4 +1,4 @@
-"""What was said on a line, and what became of the servos there."""
+"""The frames that a rig sent, and the effect on simulated servos."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ TORQUE, GOAL = "torque_enable", "goal_position"
 
 
 class WireLog:
-    """Keeps the frames that were said."""
+    """A trace that keeps the frames that were sent."""
 
     def __init__(self) -> None:
-        self.said: list[bytes] = []
+        self.sent_frames: list[bytes] = []
 
     def __call__(self, bus: str, sent: bool, data: bytes, time: float) -> None:
         if sent:
-            self.said.append(data)
+            self.sent_frames.append(data)
 
     def instructions(self) -> set[Instruction]:
-        return {Instruction(frame[4]) for frame in self.said}
+        return {Instruction(frame[4]) for frame in self.sent_frames}
 
 
 def frames(rig: LocalRig, bus: str = "arm") -> int:
-    """How many frames were said so far."""
+    """Return how many frames were sent so far."""
     return int(rig.stats()[bus]["frames"])
 
 

@@ -96,7 +96,7 @@ class Filling:
         self.seconds += seconds
 
 
-def servobus_goals(work: Callable[[Rig, float], Awaitable[int]], loop: str, filling: Filling) -> Client:
+def servobus_goals(act: Callable[[Rig, float], Awaitable[int]], loop: str, filling: Filling) -> Client:
     """So many calls through the public rig."""
 
     def client(line: Line, seconds: float) -> Sample:
@@ -106,9 +106,9 @@ def servobus_goals(work: Callable[[Rig, float], Awaitable[int]], loop: str, fill
     async def _send(line: Line, seconds: float) -> Sample:
         async with opened(line, CALLERS) as rig:
             await rig.enable()
-            await work(rig, Meter(WARM_UP_S).end)
+            await act(rig, Meter(WARM_UP_S).end)
             before, meter = line.synced(), Meter(seconds)
-            sample = meter.sample(await work(rig, meter.end))
+            sample = meter.sample(await act(rig, meter.end))
             filling.add(before, line.synced(), sample.seconds)
         return sample
 
@@ -122,9 +122,9 @@ def main(seconds: float, rounds: int) -> Report:
         "rustypot": rustypot_write,
         "feetech-servo-sdk": sdk_write,
         **{
-            f"servobus, {name}, {loop}": servobus_goals(work, loop, fillings[f"servobus, {name}, {loop}"])
+            f"servobus, {name}, {loop}": servobus_goals(act, loop, fillings[f"servobus, {name}, {loop}"])
             for loop in LOOPS
-            for name, work in ((MOVE, move), (STREAM, stream))
+            for name, act in ((MOVE, move), (STREAM, stream))
         },
     }
     with sms_line() as line:

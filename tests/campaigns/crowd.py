@@ -1,4 +1,4 @@
-"""A thousand clients of one daemon: reads, subscriptions, goals and e-stops among them, while its bus keeps its rate."""
+"""A thousand clients of one daemon read, subscribe, move and stop, while its bus keeps its rate."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from tests.campaigns.daemon import answer, daemon
 CLIENTS, RATE, HZ, MOVERS = 1000, 3.0, 5.0, 6
 FILES = 4096
 STOPPED = ("EStopped", "NotEnabled")
-"""What movers are told while the e-stop holds."""
+"""Errors that a mover gets while the e-stop is latched."""
 
 
 @dataclass(slots=True)
 class Crowd:
-    """What it saw."""
+    """What the campaign counted."""
 
     clients: int = 0
     asked: int = 0
@@ -61,7 +61,7 @@ class Crowd:
 
 
 class Member(asyncio.Protocol):
-    """One client: counts what it is told, and answers to what it asked."""
+    """One client: counts its notices and the answers to its calls."""
 
     def __init__(self, crowd: Crowd) -> None:
         self._crowd = crowd
@@ -101,7 +101,7 @@ class Member(asyncio.Protocol):
 
 
 def rss(pid: int) -> int:
-    """MB."""
+    """Return the resident memory in MB."""
     line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
     return int(line.split()[1]) // 1024
 

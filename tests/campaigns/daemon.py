@@ -30,13 +30,13 @@ buses:
 SERVOS = "".join(f"      s{number}: {{id: {number}, model: sts}}\n" for number in range(1, 7))
 READ = b'{"jsonrpc":"2.0","id":1,"method":"read","params":{"name":"arm/s1","max_age":1}}\n'
 WRITES = frozenset({0x03, 0x04, 0x05, 0x83})
-"""Instructions that write: none may be said at start."""
+"""Instructions that write: no start may send one."""
 BACK_WITHIN = 2.0
 
 
 @dataclass(slots=True)
 class Killed:
-    """What became of a daemon that was killed so often."""
+    """The figures of a daemon that was killed so often."""
 
     times: int = 0
     late: int = 0
@@ -70,7 +70,7 @@ def start(folder: Path) -> subprocess.Popen[bytes]:
 
 
 async def answer(folder: Path, within: float) -> bool:
-    """Somebody answers a read of a servo that was asked on the line."""
+    """Return whether a daemon answers a read of a servo in that time."""
     end = monotonic() + within
     while monotonic() < end:
         with suppress(OSError, ValueError, KeyError):
@@ -95,7 +95,7 @@ def kills(times: int, seed: int = 1) -> Killed:
 
 
 async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
-    """On a simulated line of a process of its own, which sees what is written at each start."""
+    """Kill and start a daemon again and again; its line is simulated in this process, which counts the frames that write."""
     from servobus.config.loader import parse_config
     from servobus.links.base import FarEnd
     from servobus.simulation.link import far_end, simulated_line
@@ -106,12 +106,12 @@ async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
     options, models = setup.buses["arm"], setup.models["arm"]
     line = simulated_line(options, models, loop)
     inner: FarEnd = far_end(options, line, loop)
-    heard = inner.receive
+    forward = inner.receive
 
     def receive(data: bytes) -> None:
         at = data.find(b"\xff\xff")
         result.writes += at >= 0 and len(data) > at + 4 and data[at + 4] in WRITES
-        heard(data)
+        forward(data)
 
     inner.receive = receive  # type: ignore[method-assign]
     pty = SimulatedPty(inner, loop)

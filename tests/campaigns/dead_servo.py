@@ -1,4 +1,4 @@
-"""A line in real time over a PTY: what a dead servo costs its neighbours, and how soon a pulled and replaced plug is noticed.
+"""A line in real time over a PTY: measures the cost of a dead servo to its neighbours, and how soon an unplugged port is noticed.
 
 The simulated line and the rig share one process and one loop, so the CPU figure counts both.
 """
@@ -98,7 +98,7 @@ async def _rate(rig: LocalRig, seconds: float) -> float:
 
 
 async def _dead_servo(rig: LocalRig, line: SimulatedLine, figures: Figures, seconds: float) -> None:
-    """Measured while callers go on asking the dead one."""
+    """Measure the rate while callers go on asking the dead servo."""
 
     async def ask_the_dead() -> None:
         while True:

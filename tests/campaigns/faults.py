@@ -1,8 +1,8 @@
-"""A faulty line in virtual time: how many values were wrong, how many awaits hung, how many tasks were left behind.
+"""A faulty line in virtual time: counts wrong values, awaits that hang and tasks that are left behind.
 
-`faults` damages one reply in a hundred in every way there is; `cancel` cancels callers at random points of a faulty line. The
-values come from an oracle, so every wrong one is seen. An await that takes longer than any turn may wait counts as hung, and one
-that never ends ends the campaign: the virtual loop notices when all wait.
+`faults` damages one reply in a hundred in every way that the fault injector knows. `cancel` cancels callers at random moments on a
+faulty line. The values come from an oracle, so every wrong one is noticed. An await that takes longer than any turn may wait counts
+as hung. An await that never ends stops the campaign, because the virtual loop notices when everything waits.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tests.virtual_time import VirtualLoop
 
 KINDS = ("loss", "late", "duplicate", "truncate", "drop_byte", "insert_byte", "flip", "wrong_id", "echo")
 LATE_MS = 100.0
-"""Five times the deadline that a node begins with."""
+"""Five times the first deadline of a node."""
 HUNG = PATIENCE + 1.0
-"""Seconds after which every call has ended: its turn came within the patience, or it failed."""
+"""Seconds after which every call has ended: it had its turn within the patience, or it failed."""
 
 
 @dataclass(slots=True)
 class Result:
-    """What a campaign found."""
+    """What a campaign counted."""
 
     reads: int = 0
     wrong: int = 0

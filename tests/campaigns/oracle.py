@@ -1,7 +1,7 @@
-"""Lines whose every answer is different and says which question it answers, so that a wrong one cannot pass for right.
+"""Far ends whose every reply is different and names the request that it answers, so that a wrong value cannot pass for right.
 
-An answer carries a number that counts up; what was asked, of whom and when, is remembered under it. A value is right when it
-answers the question that its caller asked, and no earlier one. There is one oracle for each protocol.
+A reply carries a number that counts up. The oracle remembers under that number which request it answered, of which node and when.
+A value is right when it answers the request of its caller, and no earlier one. There is one oracle for each protocol.
 """
 
 from __future__ import annotations
@@ -34,14 +34,17 @@ NUMBERS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class TunnelRequest:
+class Question:
+    """A request that was answered."""
+
     node: int
-    what: Any
-    heard: float
+    subject: Any
+    """What was read."""
+    received_at: float
 
 
 class Oracle(ABC):
-    """A FarEnd of ten servos."""
+    """A far end of ten servos."""
 
     head: str
     """The config of its bus, up to the servos."""
@@ -51,14 +54,14 @@ class Oracle(ABC):
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._deliver: Callable[[bytes], object] = bytes
-        self._questions: list[TunnelRequest | None] = [None] * NUMBERS
+        self._questions: list[Question | None] = [None] * NUMBERS
         self._count = 0
 
     def attach(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver
 
-    def set_baudrate(self, baudrate: int) -> None:  # noqa: B027 - there is nothing to do: it hears every rate
-        """It has none."""
+    def set_baudrate(self, baudrate: int) -> None:  # noqa: B027 - an oracle receives at every rate
+        """Do nothing: an oracle has no rate."""
 
     def receive(self, data: bytes) -> None:
         reply = self.answer(data)
@@ -67,33 +70,33 @@ class Oracle(ABC):
 
     @abstractmethod
     def answer(self, frame: bytes) -> bytes | None:
-        """To one whole frame."""
+        """Return the reply to one whole frame."""
 
     @abstractmethod
     def register(self, rng: random.Random) -> str:
-        """Something to read."""
+        """Return the name of something to read."""
 
     @abstractmethod
     def right(self, value: Any, node: int, register: str, asked: float) -> bool:
-        """Whether this answers a question for that register, asked of that node not before `asked`."""
+        """Return whether the value answers a request for that register of that node, sent at `asked` or later."""
 
     @abstractmethod
     def rename(self, frame: bytes, rng: random.Random) -> bytes:
-        """The same reply in the name of the next servo, which exists."""
+        """Return the same reply in the name of the next servo, which exists."""
 
-    def _ask(self, node: int, what: Any, numbers: int = NUMBERS) -> int:
+    def _number(self, node: int, subject: Any, numbers: int = NUMBERS) -> int:
         self._count = number = (self._count + 1) % numbers
-        self._questions[number] = TunnelRequest(node, what, self._loop.time())
+        self._questions[number] = Question(node, subject, self._loop.time())
         return number
 
-    def _asked(self, number: int, node: int, what: Any, asked: float) -> bool:
+    def _answers(self, number: int, node: int, subject: Any, asked: float) -> bool:
         question = self._questions[number]
-        return question is not None and (question.node, question.what) == (node, what) and question.heard >= asked
+        return question is not None and (question.node, question.subject) == (node, subject) and question.received_at >= asked
 
 
 class SmsOracle(Oracle):
-    """The number stands in the last two bytes read, and those before follow from it. The span's end tells what was asked: a
-    question may begin a byte earlier than its caller's span, so that its echo cannot be the answer."""
+    """The number is in the last two bytes of a span, and the bytes before follow from it. The end of a span identifies the request:
+    the driver may begin a byte earlier than its caller's span, so that the echo of the request cannot be the reply."""
 
     head = "    protocol: sms\n    baudrate: 1000000\n"
     servo = ", model: sts"
@@ -112,9 +115,9 @@ class SmsOracle(Oracle):
             if address == self.ID_ADDRESS:
                 data = bytes((packet.id, *bytes(size - 1)))
             elif size < 2:
-                data = bytes(size)  # too short for a number: asked only at the discovery
+                data = bytes(size)  # too short for a number: only discovery reads it
             else:
-                data = self._data(self._ask(packet.id, address + size), size)
+                data = self._data(self._number(packet.id, address + size), size)
         return sms_encode(packet.id, 0, data)
 
     def register(self, rng: random.Random) -> str:
@@ -124,7 +127,7 @@ class SmsOracle(Oracle):
         address, size = map(int, register.split(":"))
         number = int.from_bytes(bytes(value[-2:]), "little")
         expected = self._data(number, size + 1)[-size:], self._data(number, size)
-        return self._asked(number, node, address + size, asked) and len(value) == size and bytes(value) in expected
+        return self._answers(number, node, address + size, asked) and len(value) == size and bytes(value) in expected
 
     def rename(self, frame: bytes, rng: random.Random) -> bytes:
         return sms_encode(frame[2] % SERVOS + 1, frame[4], frame[5:-1])
@@ -135,7 +138,7 @@ class SmsOracle(Oracle):
 
 
 class KstOracle(Oracle):
-    """Position, status and version are numbers. A position has to be one that is believed, so there are fewer of them."""
+    """Position, status and version are numbers. Only positions in the range of the servo are believed, so there are fewer numbers."""
 
     head = "    protocol: kst\n    baudrate: 512000\n"
     servo = ""
@@ -146,30 +149,30 @@ class KstOracle(Oracle):
     def answer(self, frame: bytes) -> bytes | None:
         codec = KstCodec()
         codec.receive_data(frame)
-        heard = codec.next_reply()
-        if heard is None or not 1 <= heard.node <= SERVOS:
+        request = codec.next_reply()
+        if request is None or not 1 <= request.node <= SERVOS:
             return None
         command = Command(frame[3])
-        data = bytes((heard.node,))
+        data = bytes((request.node,))
         if command != Command.READ_ID:
-            number = self._ask(heard.node, command, self.POSITIONS)
-            least = -900 if command == Command.READ_POSITION else 0
-            data = (number + least).to_bytes(2, "little", signed=True)
-        return kst_encode(heard.node, command + 0x40, data)
+            number = self._number(request.node, command, self.POSITIONS)
+            minimum = -900 if command == Command.READ_POSITION else 0
+            data = (number + minimum).to_bytes(2, "little", signed=True)
+        return kst_encode(request.node, command + 0x40, data)
 
     def register(self, rng: random.Random) -> str:
         return rng.choice(self.REGISTERS)
 
     def right(self, value: int, node: int, register: str, asked: float) -> bool:
         number = value + 900 if register == "position" else value
-        return 0 <= number < self.POSITIONS and self._asked(number, node, self.CODES[register], asked)
+        return 0 <= number < self.POSITIONS and self._answers(number, node, self.CODES[register], asked)
 
     def rename(self, frame: bytes, rng: random.Random) -> bytes:
         return kst_encode(frame[2] % SERVOS + 1, frame[3], frame[4:12])
 
 
 class RohOracle(Oracle):
-    """The number is the last word read. What tells the map stands where it has to."""
+    """The number is the last register that is read. The registers that tell the map of the hand are the real ones."""
 
     head = "    protocol: roh\n    baudrate: 115200\n"
     servo = ", channel: index"
@@ -179,25 +182,28 @@ class RohOracle(Oracle):
     def answer(self, frame: bytes) -> bytes | None:
         codec = ModbusCodec("device")
         codec.receive_data(frame)
-        heard = codec.next_reply()
-        if heard is None or not 1 <= heard.unit <= SERVOS or heard.function != Function.READ_HOLDING:
+        request = codec.next_reply()
+        if request is None or not 1 <= request.unit <= SERVOS or request.function != Function.READ_HOLDING:
             return None
-        address, count = unpack(heard.data)
-        told = list(self.FIRST[:count]) if address == 1000 else self._words(self._ask(heard.unit, (address, count)), count)
-        return modbus_encode(heard.unit, heard.function, bytes((2 * count,)) + pack(told))
+        address, count = unpack(request.data)
+        if address == 1000:
+            registers = list(self.FIRST[:count])
+        else:
+            registers = self._registers(self._number(request.unit, (address, count)), count)
+        return modbus_encode(request.unit, request.function, bytes((2 * count,)) + pack(registers))
 
     def register(self, rng: random.Random) -> str:
         return rng.choice(self.SPANS)
 
     def right(self, value: Sequence[int], node: int, register: str, asked: float) -> bool:
         address, count = map(int, register.split(":"))
-        return self._asked(value[-1], node, (address, count), asked) and list(value) == self._words(value[-1], count)
+        return self._answers(value[-1], node, (address, count), asked) and list(value) == self._registers(value[-1], count)
 
     def rename(self, frame: bytes, rng: random.Random) -> bytes:
         return modbus_encode(frame[0] % SERVOS + 1, frame[1], frame[2:-2])
 
     @staticmethod
-    def _words(number: int, count: int) -> list[int]:
+    def _registers(number: int, count: int) -> list[int]:
         return [(number * at) & 0xFFFF for at in range(2, count + 1)] + [number]
 
 
@@ -205,19 +211,19 @@ ORACLES: dict[str, type[Oracle]] = {"sms": SmsOracle, "kst": KstOracle, "roh": R
 
 
 def service(protocol: str, faults: FaultOptions) -> tuple[BusService, Link, Oracle]:
-    """A bus on an oracle, with the faults in between; the link is to be connected."""
+    """Return a bus on an oracle with the faults in between, its link (not connected yet), and the oracle."""
     loop = asyncio.get_running_loop()
     oracle = ORACLES[protocol](loop)
     servos = "".join(f"      s{number}: {{id: {number}{oracle.servo}}}\n" for number in range(1, SERVOS + 1))
     text = f"version: 1\nbuses:\n  line:\n{oracle.head}    port: 'sim:'\n    servos:\n{servos}"
     config = parse_config(text, "campaign", Path())
     options, models = config.buses["line"], config.models["line"]
-    entry = PROTOCOLS[protocol]
-    far = FaultyEnd(oracle, faults, loop, rename=oracle.rename, node_of=entry.node_of)
+    definition = PROTOCOLS[protocol]
+    far = FaultyEnd(oracle, faults, loop, rename=oracle.rename, node_of=definition.node_of)
     link = MemoryLink(far, LineTraits())
-    bus = BusService("line", options, entry.driver(options, models), entry.codec(options), link.traits, _event)
+    bus = BusService("line", options, definition.driver(options, models), definition.codec(options), link.traits, _event)
     return bus, link, oracle
 
 
 def _event(name: str, **fields: object) -> None:
-    """Campaigns count; they do not log."""
+    """Do nothing: campaigns count, they do not log."""

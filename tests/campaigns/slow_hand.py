@@ -1,4 +1,4 @@
-"""A hand that answers some questions later than the deadline, while its registers change: each value is right or a timeout."""
+"""A hand that answers some requests later than the deadline while its registers change: each value is right, or a timeout."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ buses:
   hand: {protocol: roh, port: "sim:", baudrate: 115200, timeout_ms: 15, servos: {index: {id: 2, channel: index}}}
 """
 REGISTERS = ("1185:1", "1186:1", "1195:1", "1205:1")
-"""Settings of single words: their answers differ in nothing but the value."""
+"""Settings of one register each: their replies differ in nothing but the value."""
 LATE_S = (0.016, 0.030, 0.075, 0.150)
 """Beyond the deadline, by up to ten times."""
 
 
 def slow_hand(reads: int, seed: int = 1) -> Result:
-    """So many reads; every fifth answer comes too late."""
+    """So many reads; every fifth reply comes too late."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(_slow_hand(reads, random.Random(seed)))
 
 
 async def _slow_hand(reads: int, rng: random.Random) -> Result:
     config = parse_config(TEXT, "campaign", Path())
-    options, entry, result = config.buses["hand"], PROTOCOLS["roh"], Result()
-    hands = [hand for hand in entry.devices(options, config.models["hand"]) if isinstance(hand, RohDevice)]
+    options, definition, result = config.buses["hand"], PROTOCOLS["roh"], Result()
+    hands = [hand for hand in definition.devices(options, config.models["hand"]) if isinstance(hand, RohDevice)]
     loop = asyncio.get_running_loop()
-    with closing(SimulatedLine(hands, entry.device_codec(options), loop, baudrate=options.baudrate)) as line:
+    with closing(SimulatedLine(hands, definition.device_codec(options), loop, baudrate=options.baudrate)) as line:
         link = MemoryLink(line, LineTraits(options.baudrate, paced=True))
-        driver = entry.driver(options, config.models["hand"])
-        bus = BusService("hand", options, driver, entry.codec(options), link.traits, lambda name, **fields: None)
+        driver = definition.driver(options, config.models["hand"])
+        bus = BusService("hand", options, driver, definition.codec(options), link.traits, lambda name, **fields: None)
         await link.connect(bus.master)
         await bus.start()
         for number in range(reads):
@@ -58,17 +58,17 @@ async def _slow_hand(reads: int, rng: random.Random) -> Result:
 
 
 async def _read(bus: BusService, hand: RohDevice, number: int, rng: random.Random, result: Result) -> None:
-    """All registers hold another number each time, each its own."""
-    for place, register in enumerate(REGISTERS):
-        hand._memory[int(register.partition(":")[0])] = (4 * number + place) & 0xFFFF
+    """Each register has a number of its own, another one for each read."""
+    for index, register in enumerate(REGISTERS):
+        hand._memory[int(register.partition(":")[0])] = (4 * number + index) & 0xFFFF
     hand.extra_delay = rng.choice(LATE_S) if rng.random() < 0.2 else 0.0
-    place = rng.randrange(len(REGISTERS))
+    index = rng.randrange(len(REGISTERS))
     asked = bus.clock()
     try:
-        (value,) = await bus.read_register("index", REGISTERS[place])
+        (value,) = await bus.read_register("index", REGISTERS[index])
     except ReplyTimeout:
         result.timeouts += 1
     else:
         result.reads += 1
-        result.wrong += value != (4 * number + place) & 0xFFFF
+        result.wrong += value != (4 * number + index) & 0xFFFF
     result.hung += bus.clock() - asked > HUNG

@@ -21,12 +21,12 @@ buses:
       elbow: {id: 2, model: sts, zero: 1000}
       wrist: {id: 3, model: sts, zero: 3000}
 """
-"""The servos stand at 2048, 1000 and 3000."""
+"""The servos are at 2048, 1000 and 3000."""
 
 
 @contextmanager
 def served(folder: Path, config: str = CONFIG) -> Iterator[str]:
-    """The path of its port. At the end it is interrupted, as a person would do it."""
+    """Yield the path of its port. At the end the process is interrupted, as by Ctrl-C."""
     file = folder / "sim.yaml"
     file.write_text(config)
     command = [sys.executable, "-m", "servobus", "sim", str(file)]

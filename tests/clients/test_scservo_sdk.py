@@ -16,18 +16,18 @@ GOAL_POSITION, PRESENT_POSITION, LOCK, ID, MOVING, TORQUE = 42, 56, 55, 5, 66, 4
 STS3215 = 777
 STANDING = {1: 2048, 2: 1000, 3: 3000}
 READS = 2000
-"""After so many questions a servo should have arrived."""
+"""A servo arrives within so many reads."""
 
 
 class PatientPort(scservo_sdk.PortHandler):  # type: ignore[misc]
-    """The SDK waits 34 ms, which a busy machine may need for other things."""
+    """A port that waits longer than the 34 ms of the SDK, because a test machine may be busy."""
 
     def setPacketTimeout(self, packet_length: int) -> None:
         self.setPacketTimeoutMillis(10_000)
 
 
 class Client:
-    """Port and packet handler, as all calls of the SDK want both. Anything but success fails."""
+    """Port and packet handler of the SDK; anything but success fails."""
 
     def __init__(self, port: Any) -> None:
         self.port = port
@@ -71,27 +71,27 @@ def sync_read(client: Client, nodes: list[int]) -> dict[int, int]:
 
 
 def test_ping_tells_the_model(client: Client) -> None:
-    """Each of the configured ids."""
+    """Each configured servo answers with its model."""
     for node in STANDING:
         assert client.packets.ping(client.port, node) == (STS3215, scservo_sdk.COMM_SUCCESS, 0)
 
 
-def test_nobody_answers_for_another_id(path: str) -> None:
-    """With the SDK's own patience, that is."""
+def test_another_id_is_silent(path: str) -> None:
+    """The SDK ends with its own timeout."""
     port = scservo_sdk.PortHandler(path)
     assert port.openPort()
     assert scservo_sdk.PacketHandler(0).ping(port, 9)[1] == scservo_sdk.COMM_RX_TIMEOUT
     port.closePort()
 
 
-def test_read_and_sync_read_tell_where_they_stand(client: Client) -> None:
-    """In any order."""
+def test_read_and_sync_read_have_every_position(client: Client) -> None:
+    """SYNC READ keeps the order of the request."""
     assert {node: client.read(node, PRESENT_POSITION, 2) for node in STANDING} == STANDING
     assert sync_read(client, [3, 1, 2]) == STANDING
 
 
 def test_a_written_goal_is_reached(client: Client) -> None:
-    """And torque is on by it."""
+    """Writing a goal switches torque on."""
     client.write(1, GOAL_POSITION, 2100, 2)
     assert client.read(1, GOAL_POSITION, 2) == 2100
     assert client.read(1, TORQUE) == 1
@@ -102,7 +102,7 @@ def test_a_written_goal_is_reached(client: Client) -> None:
 
 
 def test_sync_write_moves_several(client: Client) -> None:
-    """All in one frame; who is not named stays."""
+    """Two servos move by one frame; the third stays."""
     goals = {2: 1040, 3: 2960}
     for targets in (goals, STANDING):
         group = scservo_sdk.GroupSyncWrite(client.port, client.packets, GOAL_POSITION, 2)
@@ -115,7 +115,7 @@ def test_sync_write_moves_several(client: Client) -> None:
 
 
 def test_reg_write_waits_for_action(client: Client) -> None:
-    """The SDK's calls for it; ACTION is a broadcast."""
+    """A servo moves at ACTION, not at REG WRITE."""
     assert client.packets.regWriteTxRx(client.port, 1, GOAL_POSITION, 2, [0x40, 0x08]) == (scservo_sdk.COMM_SUCCESS, 0)
     before = client.read(1, PRESENT_POSITION, 2)
     assert client.packets.action(client.port, scservo_sdk.BROADCAST_ID) == scservo_sdk.COMM_SUCCESS
@@ -126,7 +126,7 @@ def test_reg_write_waits_for_action(client: Client) -> None:
 
 
 def test_an_id_can_be_set_and_set_back(client: Client) -> None:
-    """Unlock, write, lock: the last under the new id. The reply to the id may name either, so the SDK is not asked to wait."""
+    """The lock is written under the new id. The reply to the id write may have either id, so the SDK does not wait for it."""
     for old, new in ((3, 13), (13, 3)):
         client.write(old, LOCK, 0)
         assert client.packets.write1ByteTxOnly(client.port, old, ID, new) == scservo_sdk.COMM_SUCCESS
@@ -136,7 +136,7 @@ def test_an_id_can_be_set_and_set_back(client: Client) -> None:
 
 
 def port_is_clear(client: Client) -> None:
-    """The six bytes of a reply that was not waited for."""
+    """Read the six bytes of a reply that was not awaited."""
     client.port.setPacketTimeout(6)
     reply, result = client.packets.rxPacket(client.port)
     assert (result, len(reply)) == (scservo_sdk.COMM_SUCCESS, 6)

@@ -23,7 +23,7 @@ COMMANDS = [
     for line in block.splitlines()
     if line.startswith("servobus ") and not line.startswith("servobus --")
 ]
-OPENING = [(page, text) for page in PAGES for text in blocks(page, "python") if "servobus.open(" in text]
+OWN_PORTS = [(page, text) for page in PAGES for text in blocks(page, "python") if "servobus.open(" in text]
 CONNECTING = [
     (page, text) for page in PAGES for text in blocks(page, "python") if ".connect(" in text and "servobus.open(" not in text
 ]
@@ -66,7 +66,7 @@ def run(program: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("page", "text"), OPENING)
+@pytest.mark.parametrize(("page", "text"), OWN_PORTS)
 def test_programs_with_ports_of_their_own(page: str, text: str) -> None:
     run(text)
 

@@ -51,11 +51,11 @@ async def test_enable_takes_the_present_position_as_goal_before_torque() -> None
     async with open_rig(config("s1: {id: 1, model: sts, zero: 2048}"), trace=wire) as rig:
         device = devices(rig)[1]
         device.joint.position = 1000.0
-        wire.said.clear()
+        wire.sent_frames.clear()
         await rig["s1"].enable()
         assert energised(device)
         assert device.get(GOAL) == 1000
-        writes = [frame[5] for frame in wire.said if frame[4] == Instruction.WRITE]
+        writes = [frame[5] for frame in wire.sent_frames if frame[4] == Instruction.WRITE]
         goal, torque = device.model.registers[GOAL].address, device.model.registers[TORQUE].address
         assert writes.index(goal) < writes.index(torque)
 
@@ -106,10 +106,10 @@ async def test_goals_of_one_moment_leave_in_one_frame() -> None:
     wire = WireLog()
     async with open_rig(config(), trace=wire) as rig:
         await rig.enable()
-        wire.said.clear()
+        wire.sent_frames.clear()
         outcomes = await asyncio.gather(*(servo.move_to(5) for servo in rig))
         assert outcomes == [Outcome.SENT] * 3
-        assert [frame[4] for frame in wire.said] == [Instruction.SYNC_WRITE]
+        assert [frame[4] for frame in wire.sent_frames] == [Instruction.SYNC_WRITE]
 
 
 @virtual

@@ -136,7 +136,7 @@ async def test_unplug_fails_what_waits_and_replug_sends_no_old_goal() -> None:
             await moving
         with pytest.raises(LinkDown):
             await rig["s1"].move_to(3)
-        wire.said.clear()
+        wire.sent_frames.clear()
         link.plug()  # type: ignore[attr-defined]
         await asyncio.sleep(1)
         assert (await rig.read("s1")).position == 0
