@@ -1,5 +1,7 @@
-"""The part of JSON Schema that the config's schema needs: decides whether an editor would accept some data. A keyword that it does
-not know is an error, so that no keyword is ignored."""
+"""The part of JSON Schema that the config's schema needs: decides whether an editor would accept some data.
+
+A keyword that it does not know is an error, so that no keyword is ignored.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ STS = {
 
 
 def config(*servos: str, port: str = "sim:", **keys: Any) -> Config:
-    """Return a config with one bus `arm` at 1 Mbaud. `servos`: lines of YAML; `keys`: more keys of the bus, in YAML flow style."""
+    """Return a config with a bus `arm` at 1 Mbaud. `servos`: lines of YAML; `keys`: more keys of the bus, in YAML flow style."""
     lines = [
         f"    {key}: {value}" for key, value in {"protocol": "sms", "port": f"{port!r}", "baudrate": 1000000, **keys}.items()
     ]

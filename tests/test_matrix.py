@@ -19,8 +19,8 @@ from tests.virtual_time import virtual
 
 @dataclass(frozen=True)
 class Delivery:
-    """What the line does to replies. `lossy`: a verb may end in a typed error. `patience`: more seconds that a reply may take on a
-    busy machine; 0 where replies are lost."""
+    """What the line does to replies. `lossy`: a verb may end in a typed error. `patience`: more seconds that a reply may take
+    on a busy machine; 0 where replies are lost."""
 
     faults: str
     lossy: bool = False

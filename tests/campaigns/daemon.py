@@ -12,10 +12,15 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
+
+from servobus.config.loader import parse_config
+from servobus.links.base import FarEnd
+from servobus.simulation.link import far_end, simulated_line
+from servobus.simulation.pty import SimulatedPty
 
 RIG = """version: 1
 door: {rate: null, clients: 5000, clients_per_user: 5000}
@@ -94,29 +99,27 @@ def kills(times: int, seed: int = 1) -> Killed:
         return asyncio.run(_kills(Path(folder), times, random.Random(seed)))
 
 
-async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
-    """Kill and start a daemon again and again; its line is simulated in this process, which counts the frames that write."""
-    from servobus.config.loader import parse_config
-    from servobus.links.base import FarEnd
-    from servobus.simulation.link import far_end, simulated_line
-    from servobus.simulation.pty import SimulatedPty
+class Watched:
+    """A far end that counts the frames that write."""
 
+    def __init__(self, inner: FarEnd, result: Killed) -> None:
+        self._inner, self._result = inner, result
+        self.attach, self.set_baudrate = inner.attach, inner.set_baudrate
+
+    def receive(self, data: bytes) -> None:
+        at = data.find(b"\xff\xff")
+        self._result.writes += at >= 0 and len(data) > at + 4 and data[at + 4] in WRITES
+        self._inner.receive(data)
+
+
+async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
+    """Kill and start a daemon again and again; its line is simulated in this process."""
     loop, result = asyncio.get_running_loop(), Killed()
     setup = parse_config(RIG % '"sim:"' + SERVOS, "campaign")
     options, models = setup.buses["arm"], setup.models["arm"]
-    line = simulated_line(options, models, loop)
-    inner: FarEnd = far_end(options, line, loop)
-    forward = inner.receive
-
-    def receive(data: bytes) -> None:
-        at = data.find(b"\xff\xff")
-        result.writes += at >= 0 and len(data) > at + 4 and data[at + 4] in WRITES
-        forward(data)
-
-    inner.receive = receive  # type: ignore[method-assign]
-    pty = SimulatedPty(inner, loop)
-    try:
-        with daemon(folder, pty.path) as process:
+    with closing(simulated_line(options, models, loop)) as line:
+        watched = Watched(far_end(options, line, loop), result)
+        with closing(SimulatedPty(watched, loop)) as pty, daemon(folder, pty.path) as process:
             current = process
             for _ in range(times):
                 began = monotonic()
@@ -130,7 +133,4 @@ async def _kills(folder: Path, times: int, rng: random.Random) -> Killed:
                 current = start(folder)
             current.kill()
             current.wait()
-    finally:
-        pty.close()
-        line.close()
     return result

@@ -1,8 +1,8 @@
 """A faulty line in virtual time: counts wrong values, awaits that hang and tasks that are left behind.
 
-`faults` damages one reply in a hundred in every way that the fault injector knows. `cancel` cancels callers at random moments on a
-faulty line. The values come from an oracle, so every wrong one is noticed. An await that takes longer than any turn may wait counts
-as hung. An await that never ends stops the campaign, because the virtual loop notices when everything waits.
+`faults` damages one reply in a hundred in every way that the fault injector knows. `cancel` cancels callers at random moments on
+a faulty line. The values come from an oracle, so every wrong one is noticed. An await that takes longer than any turn may wait
+counts as hung. An await that never ends stops the campaign, because the virtual loop notices when everything waits.
 """
 
 from __future__ import annotations

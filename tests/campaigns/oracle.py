@@ -95,8 +95,8 @@ class Oracle(ABC):
 
 
 class SmsOracle(Oracle):
-    """The number is in the last two bytes of a span, and the bytes before follow from it. The end of a span identifies the request:
-    the driver may begin a byte earlier than its caller's span, so that the echo of the request cannot be the reply."""
+    """The number is in the last two bytes of a span, and the bytes before follow from it. The end of a span identifies the
+    request: the driver may begin a byte earlier than its caller's span, so that the echo of the request cannot be the reply."""
 
     head = "    protocol: sms\n    baudrate: 1000000\n"
     servo = ", model: sts"
@@ -138,7 +138,7 @@ class SmsOracle(Oracle):
 
 
 class KstOracle(Oracle):
-    """Position, status and version are numbers. Only positions in the range of the servo are believed, so there are fewer numbers."""
+    """Position, status and version are numbers. Only positions in the servo's range are believed, so there are fewer numbers."""
 
     head = "    protocol: kst\n    baudrate: 512000\n"
     servo = ""

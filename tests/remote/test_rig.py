@@ -243,7 +243,7 @@ async def test_a_call_that_is_too_much(tmp_path: Path) -> None:
 @virtual
 async def test_what_is_no_number_never_leaves(tmp_path: Path, value: Any) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
-        before = len(daemon.heard)
+        before = len(daemon.received)
         with pytest.raises(LimitError, match=r"arm/s1: value: .* is not a finite number"):
             await rig["s1"].move_to(value)
         with pytest.raises(LimitError, match="arm/s2"):
@@ -258,7 +258,7 @@ async def test_what_is_no_number_never_leaves(tmp_path: Path, value: Any) -> Non
         with pytest.raises(InvalidRequest, match="twice"):
             await rig.move({"s1": 1, "arm/s1": 1})
         assert await rig.move({}) == {}
-        assert len(daemon.heard) == before
+        assert len(daemon.received) == before
 
 
 @virtual
