@@ -5,9 +5,8 @@ from typing import Any
 from servobus.protocols.definition import ProtocolDefinition
 from servobus.protocols.modbus.codec import MAX_UNIT, ModbusCodec, node_of, rename
 from servobus.protocols.roh.driver import RohDriver
-from servobus.protocols.roh.model import CHANNELS
-from servobus.protocols.roh.model_loading import load_models
-from servobus.protocols.roh.options import RohBus
+from servobus.protocols.roh.model import load_models
+from servobus.protocols.roh.options import CHANNELS, RohBus
 from servobus.protocols.roh.simulated.device import devices
 
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from servobus.errors import LimitError, NotSupported
-from servobus.protocols.roh.model import CHANNELS, FULL, RohModel, RohRegister
-from servobus.protocols.roh.options import RohServo
+from servobus.protocols.roh.model import FULL, RohModel, RohRegister
+from servobus.protocols.roh.options import CHANNELS, RohServo
 from servobus.protocols.roh.spans import Span
 from servobus.protocols.speed import goal_speed
 from servobus.values import ServoGoal, Update, is_number

@@ -14,8 +14,7 @@ from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Plan, Request, ask
 from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, ReadHolding, RtuTiming, WriteMultiple, WriteSingle
 from servobus.protocols.roh.finger import Finger
-from servobus.protocols.roh.model import RohModel
-from servobus.protocols.roh.model_loading import NEWEST
+from servobus.protocols.roh.model import NEWEST, RohModel
 from servobus.protocols.roh.options import MAPS
 from servobus.protocols.roh.spans import Limits, Span, read_spans
 from servobus.values import Identity, Update

@@ -1,4 +1,4 @@
-"""The register maps of ROH hands: how many channels a register has, and how a hand tells its map.
+"""The register maps of ROH hands, which are packaged files: how many channels a register has, and how a hand tells its map.
 
 A register is a 16-bit word, high byte first. A register of the fingers exists once for each channel, at consecutive addresses, so
 one read or write carries all of them.
@@ -6,21 +6,20 @@ one read or write carries all of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from servobus.errors import LimitError, NotSupported
+from servobus.errors import ConfigError, LimitError, NotSupported
 from servobus.protocols.model import Pair, Register, ServoModel
+from servobus.protocols.model_files import ModelFiles
+from servobus.protocols.roh.options import CHANNELS, MAPS, Channel, RohBus, RohServo
 
 WORD = 0x10000
 FULL = 0xFFFF
 """Logical position of a closed finger."""
-
-Channel = Literal["thumb_bend", "index", "middle", "ring", "little", "thumb_rotation"]
-CHANNELS: tuple[Channel, ...] = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
-"""In the order of their numbers on the wire."""
 
 REQUIRED = (
     "fw_version", "sub_exception", "node_id", "status", "current_limit", "current", "speed", "pos_target", "pos", "angle_target",
@@ -122,3 +121,34 @@ class RohModel(ServoModel):
 
     def status_name(self, code: Any) -> str:
         return str(self.registers["status"].to_physical(code))
+
+
+FILES = ModelFiles(RohModel, Path(__file__).parent / "models")
+NEWEST = MAPS[-1]
+"""The map that is assumed where a hand's map is not known and nothing is sent: config checks, previews, simulated hands."""
+
+
+def packaged_models() -> Mapping[str, RohModel]:
+    """Return the maps by name."""
+    return FILES.packaged
+
+
+def load_models(options: RohBus, folder: Path) -> Mapping[str, RohModel]:
+    """Return all maps, because a hand's map is only known when it was asked, and `finger`, which config checks use.
+
+    Raises ConfigError for limits in degrees that the finger cannot reach.
+    """
+    maps = packaged_models()
+    for name, servo in options.servos.items():
+        _check_angles(name, servo, maps[NEWEST])
+    return {**maps, "finger": maps[NEWEST]}
+
+
+def _check_angles(name: str, servo: RohServo, model: RohModel) -> None:
+    if servo.unit != "deg":
+        return
+    calibration = servo.calibration(model)
+    low, high = sorted(calibration.to_unit(angle / model.units["deg"]) for angle in model.angles[servo.channel])
+    for value in (*(servo.limits or ()), servo.park_pose):
+        if value is not None and not low - 1e-9 <= value <= high + 1e-9:
+            raise ConfigError(f"servo {name}: {value:g} deg is outside {low:g} to {high:g}, the range of {servo.channel}")

@@ -11,8 +11,10 @@ from servobus.protocols.base import LineTraits
 from servobus.protocols.modbus.codec import MAX_READ, MAX_UNIT, MAX_WRITE
 from servobus.protocols.model import Data
 from servobus.protocols.options import BusOptions, Name, ServoOptions
-from servobus.protocols.roh.model import Channel
 
+Channel = Literal["thumb_bend", "index", "middle", "ring", "little", "thumb_rotation"]
+CHANNELS: tuple[Channel, ...] = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
+"""In the order of their numbers on the wire."""
 Unit = Annotated[int, Field(ge=1, le=MAX_UNIT)]
 Map = Literal["legacy", "v1", "v2"]
 MAPS: tuple[Map, ...] = ("legacy", "v1", "v2")

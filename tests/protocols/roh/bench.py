@@ -10,9 +10,8 @@ from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.modbus.codec import Frame, ModbusCodec, encode, pack, unpack
 from servobus.protocols.roh.driver import RohDriver
-from servobus.protocols.roh.model import CHANNELS
-from servobus.protocols.roh.model_loading import load_models, packaged_models
-from servobus.protocols.roh.options import RohBus
+from servobus.protocols.roh.model import load_models, packaged_models
+from servobus.protocols.roh.options import CHANNELS, RohBus
 from servobus.protocols.roh.simulated.device import RohDevice, devices
 from servobus.values import Goal, Outcome, ServoGoal
 

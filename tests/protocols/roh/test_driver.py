@@ -11,7 +11,7 @@ from servobus.errors import DeviceError, ReplyTimeout, UnknownName
 from servobus.protocols.base import Driver
 from servobus.protocols.modbus.codec import pack, reply_key
 from servobus.protocols.roh.driver import MAX_FENCE
-from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.options import CHANNELS
 from servobus.values import Identity
 from tests.protocols.roh.bench import Bench, bench_of, goal
 

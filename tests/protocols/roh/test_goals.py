@@ -14,7 +14,7 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.modbus.codec import Function
 from servobus.protocols.roh.driver import RohDriver
-from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.options import CHANNELS
 from servobus.protocols.roh.spans import Span, read_spans, write_spans
 from servobus.values import ServoGoal, StopTarget
 from tests.protocols.roh.bench import HAND, THREE, Bench, all_fingers, goal, three_hands

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from servobus.errors import ConfigError, LimitError, UnknownName
 from servobus.protocols.base import LineTraits
 from servobus.protocols.roh import DEFINITION
-from servobus.protocols.roh.model import CHANNELS, RohModel
-from servobus.protocols.roh.model_loading import FILES, load_models, packaged_models
+from servobus.protocols.roh.model import FILES, RohModel, load_models, packaged_models
+from servobus.protocols.roh.options import CHANNELS
 from tests.protocols.roh.bench import HAND, bus_options
 
 INDEX = HAND["index"]

@@ -9,7 +9,7 @@ import pytest
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.base import LineTraits, run_plan
 from servobus.protocols.modbus.requests import WriteSingle
-from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.options import CHANNELS
 from tests.protocols.roh.bench import Bench, bench_of, goal
 
 MAPS = pytest.mark.parametrize("name", ["legacy", "v1", "v2"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from servobus.protocols.roh.model import CHANNELS
+from servobus.protocols.roh.options import CHANNELS
 from servobus.values import StopTarget
 from tests.protocols.roh.bench import Bench, all_fingers, three_hands
 

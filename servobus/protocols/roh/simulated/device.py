@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from servobus.protocols.base import DeviceReply
 from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame, Function, encode, pack, unpack
-from servobus.protocols.roh.model import RohModel
-from servobus.protocols.roh.model_loading import NEWEST
+from servobus.protocols.roh.model import NEWEST, RohModel
 from servobus.protocols.roh.options import RohBus
 from servobus.protocols.roh.simulated.hand import Refusal, SimulatedHand
 

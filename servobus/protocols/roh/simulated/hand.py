@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from servobus.protocols.roh.model import CHANNELS, FULL, RohModel, RohRegister
+from servobus.protocols.roh.model import FULL, RohModel, RohRegister
+from servobus.protocols.roh.options import CHANNELS
 from servobus.protocols.roh.simulated.finger import SimulatedFinger
 
 SELF_TEST = 0.5
