@@ -32,29 +32,31 @@ class Travel:
         self.range: tuple[int, int] | None = None
         """None: others may move the servo too, so its readings show nothing."""
         self.jumped = False
+        self.confirmed: int | None = None
+        """The last goal that it confirmed."""
         self._jump = jump
         self._goals: tuple[int, ...] = ()
-        """The goals it may be travelling to: the lowest and the highest since the last one that it confirmed, and the last."""
+        """The lowest and the highest of the goals it may be travelling to: the last confirmed one, and those sent since."""
 
     def begin(self, raw: int) -> None:
         """The servo is here, and from now on only goals of ours move it."""
-        self.last, self.range, self.jumped, self._goals = raw, (raw, raw), False, ()
+        self.last, self.range, self.jumped, self.confirmed, self._goals = raw, (raw, raw), False, None, ()
 
     def end(self) -> None:
         """From now on others may move it."""
-        self.range, self._goals = None, ()
+        self.range, self.confirmed, self._goals = None, None, ()
 
     def send(self, raw: int) -> None:
         """A goal is about to leave; the servo may obey it, whether it confirms it or not."""
         if self.range is not None:
             self.range = min(self.range[0], raw), max(self.range[1], raw)
             goals = (*self._goals, raw)
-            self._goals = min(goals), max(goals), raw
+            self._goals = min(goals), max(goals)
 
     def confirm(self, raw: int) -> None:
         """The servo has confirmed this goal, so earlier ones do not count any more."""
         if self.range is not None:
-            self._goals = (raw,)
+            self.confirmed, self._goals = raw, (raw,)
 
     def read(self, raw: int) -> None:
         """The servo was read here."""
@@ -64,11 +66,6 @@ class Travel:
             self.jumped = self.jumped or not low - self._jump <= raw <= high + self._jump
             ends = (raw, *self._goals)
             self.range = min(ends), max(ends)
-
-    @property
-    def goal(self) -> int | None:
-        """The last goal sent."""
-        return self._goals[-1] if self._goals else None
 
 
 class CalibratedServo:
@@ -130,15 +127,16 @@ class CalibratedServo:
         * The servo may have restarted, or others may move it: the last reading. Its old goal would move it.
         * The setpoint is known: that, inside the travel range. Setpoints of a ramp are one step of the ramp apart, so this is
           where it is, or nearly.
-        * Otherwise: the last goal sent, else the last reading.
+        * Otherwise: the last goal that it confirmed, else the last reading. A goal that it did not confirm may be lost, so to
+          send it again could move the servo.
         """
         travel = self.travel
         raw = travel.last
         if travel.range is not None and not travel.jumped:
             if setpoint is not None:
                 raw = _clamp(self.calibration.to_raw(setpoint), travel.range)
-            elif travel.goal is not None:
-                raw = travel.goal
+            elif travel.confirmed is not None:
+                raw = travel.confirmed
         return None if raw is None else _clamp(raw, self.range)
 
     # Fields of State

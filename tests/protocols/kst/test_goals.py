@@ -169,6 +169,17 @@ def test_a_stop_reads_a_position_that_it_does_not_have() -> None:
     assert "its position is not known" in reports["tilt"].detail
 
 
+def test_a_stop_does_not_send_a_goal_again_that_was_lost() -> None:
+    """Nobody knows whether it was obeyed, so the servo is held where it was read last."""
+    bench = enabled()
+    bench.loses = lambda request: True
+    move(bench, pan=40)
+    bench.loses = lambda request: False
+    bench.frames()
+    bench.run(bench.driver.stop([target("pan")]))
+    assert bench.frames() == [position_frame(1, 0)]
+
+
 def test_a_servo_that_has_restarted_is_not_sent_back() -> None:
     """KST RS422, 3.5: after a restart the position is a default value."""
     bench = enabled()

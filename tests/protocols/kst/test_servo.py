@@ -190,7 +190,7 @@ def test_enabling_forgets_the_jump_and_disabling_the_question() -> None:
     assert [*jumped, travel.jumped] == [True, False, False]
 
 
-def test_a_stop_holds_the_last_goal_sent_else_the_last_reading() -> None:
+def test_a_stop_holds_the_last_confirmed_goal_else_the_last_reading() -> None:
     servo = fitted()
     travel = servo.travel
     held = [servo.hold_steps(None)]
@@ -205,7 +205,7 @@ def test_a_stop_holds_the_last_goal_sent_else_the_last_reading() -> None:
     for step, raw in steps:
         step(raw)
         held.append(servo.hold_steps(None))
-    assert held == [None, 120, 150, 400, 400, 400, 0]
+    assert held == [None, 120, 150, 150, 400, 400, 0]
 
 
 def test_a_stop_holds_the_setpoint_inside_the_travel_range() -> None:

@@ -67,8 +67,7 @@ class KstDevice:
         self._rates = dict(baud_table or BAUD_TABLE)
         self._new = self._stored = (servo_id, baudrate)
         """Id and rate that were set, and those that were saved."""
-        self._moved_at = -math.inf
-        self._awake = -math.inf
+        self._moved_at = self._awake = -math.inf
 
     def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
         """Obey a command; see `protocols.base.Device`."""
