@@ -1,7 +1,7 @@
 """Who may use a daemon and in which role: the YAML keys `access` and `door`.
 
-A role may do what the roles below it may do. On the Unix socket the role follows from the user and groups of the client's process, as
-the kernel reports them; through TCP it follows from the token.
+A role may do what the roles below it may do. On the Unix socket the role follows from the user and groups of the client's
+process, as the kernel reports them; through TCP it follows from the token.
 """
 
 from __future__ import annotations
