@@ -1,1 +1,1 @@
-"""FLOOR 5: the native door: a rig for any number of programs, by JSON-RPC 2.0, one object a line (`docs/native-door.md`)."""
+"""The daemon: one rig for many programs, by JSON-RPC 2.0, one object a line (docs/native-door.md)."""

@@ -21,12 +21,12 @@ from servobus.daemon.jsonrpc import (
     Call,
     Framer,
     Refused,
-    answered,
     call_of,
     encode,
     failure,
     notification,
     parse,
+    success,
     urgent,
 )
 from servobus.daemon.methods import HANDLERS, Services, require_role
@@ -157,7 +157,7 @@ class ClientConnection(asyncio.Protocol):
         try:
             lines = self._framer.feed(data)
         except Refused as refusal:
-            self.write(refusal.answer() + b"\n")
+            self.write(refusal.reply() + b"\n")
             self._transport.close()
             return
         allowed = set(URGENT)  # one of each in what came together goes ahead; a flood of them waits like any other call
@@ -212,7 +212,7 @@ class ClientConnection(asyncio.Protocol):
         try:
             messages = parse(line)
         except Refused as refusal:
-            self.write(refusal.answer() + b"\n")
+            self.write(refusal.reply() + b"\n")
             return
         calls: list[Call | Refused] = []
         for message in messages:
@@ -225,12 +225,12 @@ class ClientConnection(asyncio.Protocol):
             return
         (call,) = calls
         if isinstance(call, Refused):
-            self.write(call.answer() + b"\n")
+            self.write(call.reply() + b"\n")
             return
         result = self._begin(call)
         if isinstance(result, CoroutineType):
             self._spawn(self._finish(call, result))
-        elif call.wants_answer:
+        elif call.wants_reply:
             self.write(self._reply(call, result) + b"\n")
 
     def _begin(self, call: Call) -> Any:
@@ -246,25 +246,25 @@ class ClientConnection(asyncio.Protocol):
             if not isinstance(result, (ServobusError, ValueError, TypeError)):
                 log.error("internal_error", method=call.method, error=repr(result))
             return failure(call.id, result)
-        return answered(call.id, result)
+        return success(call.id, result)
 
     async def _batch(self, calls: list[Call | Refused]) -> None:
         """Do the calls one after the other, urgent ones first. The replies leave together, in the order of the calls."""
-        answers: dict[int, bytes] = {}
+        replies: dict[int, bytes] = {}
         for at in sorted(range(len(calls)), key=lambda at: getattr(calls[at], "method", "") not in URGENT):
             call = calls[at]
             if isinstance(call, Refused):
-                answers[at] = call.answer()
+                replies[at] = call.reply()
                 continue
             result = await self._ended(self._begin(call))
-            if call.wants_answer:
-                answers[at] = self._reply(call, result)
-        if answers:
-            self.write(b"[%b]\n" % b",".join(answers[at] for at in sorted(answers)))
+            if call.wants_reply:
+                replies[at] = self._reply(call, result)
+        if replies:
+            self.write(b"[%b]\n" % b",".join(replies[at] for at in sorted(replies)))
 
     async def _finish(self, call: Call, result: Awaitable[Any]) -> None:
         value = await self._ended(result)
-        if call.wants_answer:
+        if call.wants_reply:
             self.write(self._reply(call, value) + b"\n")
 
     @staticmethod

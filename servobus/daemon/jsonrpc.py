@@ -1,7 +1,6 @@
-"""Lines and what they say: framing, JSON within limits, calls and their parameters. Pure.
+"""Lines into calls: framing, JSON within limits, calls and their parameters. Pure.
 
-A line is looked at before it is parsed: how deep it is, and that no key stands in it twice, for then two readers would understand
-two things.
+A line is checked for its depth, and for a key that is in one object twice, because two readers could understand two things.
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ STEP = {ord("{"): 1, ord("["): 1, ord("}"): -1, ord("]"): -1}
 encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder().decode
 URGENT = frozenset({"stop", "renew"})
-"""Methods that wait for nothing that came before them."""
+"""Methods that do not wait for earlier calls."""
 _urgent = re.compile(rb'"(?:%b)"' % b"|".join(name.encode() for name in sorted(URGENT)))
 NO_ID = object()
-"""Of a notification: nobody waits for its answer."""
+"""The id of a notification, which gets no reply."""
 
 
 class Refused(Exception):
-    """What is wrong with a message, as JSON-RPC says it."""
+    """A message is wrong: JSON-RPC's code and the reason."""
 
     def __init__(self, code: int, message: str, call_id: Any = None) -> None:
         super().__init__(message)
         self.code = code
         self.call_id = call_id
 
-    def answer(self) -> bytes:
+    def reply(self) -> bytes:
         return failed(self.call_id, {"code": self.code, "message": str(self)})
 
 
@@ -50,7 +49,7 @@ class Call:
         self.id = call_id
 
     @property
-    def wants_answer(self) -> bool:
+    def wants_reply(self) -> bool:
         return self.id is not NO_ID
 
 
@@ -62,26 +61,26 @@ _heads = msgspec.json.Decoder(_Head | list[_Head]).decode
 
 
 def urgent(line: bytes) -> set[str]:
-    """Which of the urgent methods a line calls. It is not looked at otherwise, and may yet be refused."""
+    """The urgent methods that a line calls. The line is not checked otherwise, and may still be refused."""
     if not _urgent.search(line):
         return set()
     try:
         heads = _heads(line)
     except (ValueError, RecursionError):
-        return set()  # its turn comes, and with it what is wrong with it
+        return set()  # it is refused when its turn comes
     called = [head.method for head in (heads if isinstance(heads, list) else [heads])]  # of any type yet
     return {name for name in URGENT if name in called}
 
 
 class Framer:
-    """Cuts a stream into lines. Memory is bounded by one line."""
+    """Cuts a stream into lines; keeps at most one line in memory."""
 
     def __init__(self, limit: int = MAX_LINE) -> None:
         self._buffer = b""
         self._limit = limit
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that are whole now. Raises Refused for one that is too long."""
+        """Take bytes, and return the lines that are complete. Raises Refused for a line that is too long."""
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         if len(self._buffer) >= self._limit or any(len(line) >= self._limit for line in lines):
             raise Refused(INVALID_REQUEST, f"a line has at most {self._limit} bytes")
@@ -89,7 +88,7 @@ class Framer:
 
 
 def parse(line: bytes) -> list[Any]:
-    """The messages of a line, not looked at yet. Raises Refused."""
+    """The messages of a line, not checked yet. Raises Refused."""
     bare = STRING.sub(b"", line)
     opened = bare.count(b"{") + bare.count(b"[")
     if opened > MAX_DEPTH and max(accumulate(STEP.get(byte, 0) for byte in bare)) > MAX_DEPTH:
@@ -97,9 +96,9 @@ def parse(line: bytes) -> list[Any]:
     try:
         message = _decode(line)
     except (ValueError, RecursionError):
-        raise Refused(PARSE, "this is no JSON: one object, or an array of them, a line") from None
+        raise Refused(PARSE, "this is not JSON: send one object, or an array of them, in a line") from None
     if bare.count(b":") != _keys(message):
-        raise Refused(PARSE, "a key stands twice in one object: say it once")
+        raise Refused(PARSE, "a key is in one object twice: give it once")
     if not isinstance(message, list):
         return [message]
     if not 1 <= len(message) <= MAX_BATCH:
@@ -114,35 +113,39 @@ def _keys(value: Any) -> int:
 
 
 def call_of(message: Any) -> Call:
-    """Raises Refused, with the id to answer to where there is one."""
+    """The call of a message. Raises Refused, with the id of the call where there is one."""
     if not isinstance(message, dict):
         raise Refused(INVALID_REQUEST, "a call is an object with jsonrpc, method, params and id")
     call_id = message.get("id", NO_ID)
     if call_id is not NO_ID and (isinstance(call_id, bool) or not isinstance(call_id, (str, int, float, type(None)))):
         raise Refused(INVALID_REQUEST, "an id is a string, a number or null")
-    told = None if call_id is NO_ID else call_id
+    reply_id = None if call_id is NO_ID else call_id
     if message.get("jsonrpc") != "2.0" or message.keys() - {"jsonrpc", "method", "params", "id"}:
-        raise Refused(INVALID_REQUEST, 'a call is {"jsonrpc":"2.0","method":...,"params":{...},"id":...} and nothing else', told)
+        raise Refused(
+            INVALID_REQUEST, 'a call is {"jsonrpc":"2.0","method":...,"params":{...},"id":...} and nothing else', reply_id
+        )
     name = message.get("method")
     method = METHODS.get(name) if isinstance(name, str) else None
     if method is None or not isinstance(name, str):
-        raise Refused(NO_METHOD, f"no such method; there are {', '.join(METHODS)}", told)
-    return Call(name, _params(method.params, message.get("params", {}), told), call_id)
+        raise Refused(NO_METHOD, f"no such method; there are {', '.join(METHODS)}", reply_id)
+    return Call(name, _params(method.params, message.get("params", {}), reply_id), call_id)
 
 
-def _params(kind: type[Params], found: Any, told: Any) -> Params:
-    if isinstance(found, list):
+def _params(kind: type[Params], values: Any, reply_id: Any) -> Params:
+    if isinstance(values, list):
         fields = kind.__struct_fields__
-        if len(found) > len(fields):
-            raise Refused(INVALID_PARAMS, f"params: at most {', '.join(fields) or 'none'}", told)
-        found = dict(zip(fields, found, strict=False))
+        if len(values) > len(fields):
+            raise Refused(INVALID_PARAMS, f"params: at most {', '.join(fields) or 'none'}", reply_id)
+        values = dict(zip(fields, values, strict=False))
     try:
-        return msgspec.convert(found, kind)
+        return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise Refused(INVALID_PARAMS, f"params: {error}; there are {', '.join(kind.__struct_fields__) or 'none'}", told) from None
+        raise Refused(
+            INVALID_PARAMS, f"params: {error}; there are {', '.join(kind.__struct_fields__) or 'none'}", reply_id
+        ) from None
 
 
-def answered(call_id: Any, result: Any) -> bytes:
+def success(call_id: Any, result: Any) -> bytes:
     return b'{"jsonrpc":"2.0","id":%b,"result":%b}' % (encode(call_id), encode(result))
 
 
@@ -151,12 +154,12 @@ def failed(call_id: Any, error: dict[str, Any]) -> bytes:
 
 
 def failure(call_id: Any, error: BaseException) -> bytes:
-    """What went wrong while a call was done."""
+    """The reply for an error that a call raised."""
     if isinstance(error, ServobusError):
         return failed(call_id, encoded(error))
     if isinstance(error, (ValueError, TypeError)):
         return failed(call_id, {"code": INVALID_PARAMS, "message": str(error)})
-    return failed(call_id, {"code": INTERNAL, "message": "a mistake in the daemon: its log has more"})
+    return failed(call_id, {"code": INTERNAL, "message": "internal error of the daemon: its log says more"})
 
 
 def notification(method: str, params: bytes) -> bytes:

@@ -12,7 +12,7 @@ from servobus.rig.logs import EventLogger
 from servobus.values import EventName
 
 log = EventLogger("servobus.daemon")
-STOPPING = "the client that moved it is gone, and it is being stopped: wait a moment"
+STOPPING = "its client is lost, and it is being stopped: wait a moment"
 
 
 class LeaseWatch:

@@ -1,7 +1,7 @@
-"""Motion leases: who may move a servo now. Pure: the time is given.
+"""Motion leases: which client may move a servo now. Pure: the time is given.
 
-A lease belongs to one connection and ends when it is not renewed in time, or with the connection. Both count as the loss of the
-client. A client that lost a lease must take it again in so many words: what it said before it learned of the loss moves nothing.
+A lease belongs to one connection. It ends when it is not renewed in time, or with the connection; both count as the loss of the
+client. A client that lost a lease must acquire it again: a motion that it sent before it knew of the loss is refused.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from servobus.errors import LeaseHeld
 @dataclass(slots=True)
 class _Holder:
     label: str
-    """Its name, for messages."""
+    """Its name for other clients."""
     servos: set[str]
     expires: float
 
 
 class Leases:
-    """By client (whatever tells one connection from another) and full servo name."""
+    """Clients are any hashable objects, servos are full names, times are seconds."""
 
     def __init__(self, ttl: float) -> None:
         self.ttl = ttl
@@ -32,7 +32,7 @@ class Leases:
         self._blocked: dict[str, str] = {}
 
     def holders(self) -> dict[str, str]:
-        """Servo -> who holds it."""
+        """Servo -> label of the client that holds it."""
         return {servo: self._holders[client].label for servo, client in self._owner.items()}
 
     def held_by(self, client: Hashable) -> set[str]:
@@ -40,7 +40,7 @@ class Leases:
         return set(holder.servos) if holder else set()
 
     def check(self, client: Hashable, servos: Iterable[str]) -> None:
-        """Raises LeaseHeld when another client holds one of these."""
+        """Refuse servos that another client holds. Raises LeaseHeld."""
         for servo in servos:
             if servo in self._blocked:
                 raise LeaseHeld(self._blocked[servo], servo=servo)
@@ -50,7 +50,7 @@ class Leases:
                 raise LeaseHeld(f"{label} moves it: wait until it is released; `stop` is always free", servo=servo)
 
     def acquire(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
-        """Take it in so many words. All or none; raises LeaseHeld."""
+        """Take servos on request, all or none. Raises LeaseHeld."""
         self.check(client, servos)
         self._lost.get(client, set()).difference_update(servos)
         holder = self._holders.setdefault(client, _Holder(label, set(), now))
@@ -59,14 +59,14 @@ class Leases:
         self._owner.update(dict.fromkeys(servos, client))
 
     def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
-        """Take it by moving. Raises LeaseHeld, also for what this client lost and did not acquire again."""
+        """Take servos by moving them. Raises LeaseHeld, also for one that this client lost and did not acquire again."""
         lost = self._lost.get(client, set()).intersection(servos)
         if lost:
-            raise LeaseHeld("its motion lease has expired, so this may be an old wish: acquire it again", servo=sorted(lost)[0])
+            raise LeaseHeld("its motion lease has expired, so this may be an old motion: acquire it again", servo=sorted(lost)[0])
         self.acquire(client, label, servos, now)
 
     def renew(self, client: Hashable, now: float) -> set[str]:
-        """What it holds, for another ttl."""
+        """Prolong what the client holds by `ttl`, and return it."""
         holder = self._holders.get(client)
         if holder is None:
             return set()
@@ -74,19 +74,19 @@ class Leases:
         return set(holder.servos)
 
     def release(self, client: Hashable, servos: Collection[str]) -> None:
-        """Given back: motion goes on to its end. What it does not hold is no error."""
+        """Give servos back; motion goes on to its end. A servo that the client does not hold is no error."""
         holder = self._holders.get(client)
         if holder is not None:
             self._give_up(client, holder, holder.servos.intersection(servos))
 
     def gone(self, client: Hashable) -> set[str]:
-        """The connection is closed: what it still held."""
+        """The connection is closed. Returns what the client still held."""
         self._lost.pop(client, None)
         holder = self._holders.get(client)
         return self._give_up(client, holder, set(holder.servos)) if holder else set()
 
     def expire(self, now: float) -> dict[Hashable, set[str]]:
-        """Who was silent for too long, and what each has lost."""
+        """End the leases that were not renewed in time. Returns what each client lost."""
         lost = {}
         for client, holder in list(self._holders.items()):
             if holder.expires <= now:
@@ -98,7 +98,7 @@ class Leases:
         return min((holder.expires for holder in self._holders.values()), default=None)
 
     def block(self, servos: Iterable[str], reason: str) -> None:
-        """Nobody gets these until they are unblocked: they are being stopped or parked."""
+        """Refuse these servos to everybody until `unblock`, because they are being stopped or parked."""
         self._blocked.update(dict.fromkeys(servos, reason))
 
     def unblock(self, servos: Iterable[str]) -> None:
@@ -106,7 +106,7 @@ class Leases:
             self._blocked.pop(servo, None)
 
     def forget(self, servos: Iterable[str]) -> None:
-        """They are not in the config any more."""
+        """Servos that are not in the config any more."""
         for servo in servos:
             client = self._owner.get(servo)
             if client is not None:

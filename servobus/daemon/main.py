@@ -1,4 +1,4 @@
-"""The daemon: a rig and its door, as the system's service sees them."""
+"""The daemon's main: a rig and its clients as a service of the system, with signals, watchdog and a log of states."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig, open_rig
 from servobus.rig.logs import EventLogger
 
-LOOKS = 3
-"""Looks at the buses within the time that the system's watchdog allows."""
+CHECKS = 3
+"""Checks of the buses within the time that the system's watchdog allows."""
 
 log = EventLogger("servobus.daemon")
 
 
 async def serve_rig(config: str, path: Path, log_every: float) -> None:
-    """Until it is cancelled. The socket is claimed before a port is opened: a second daemon disturbs nobody. Raises ConfigError,
-    PortBusy."""
+    """Run the daemon of a config until it is cancelled. The socket is claimed before a port is opened, so that a second daemon
+    disturbs nothing. Raises ConfigError, PortBusy."""
     reloads = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)  # first: a SIGHUP before READY is done after it
     notifier, listener = Notifier(), claim(path)
@@ -41,7 +41,7 @@ async def serve_rig(config: str, path: Path, log_every: float) -> None:
         group.start_soon(_reload, rig, door, notifier, reloads)
         group.start_soon(_log_states, rig, log_every)
         if notifier.watchdog is not None:
-            group.start_soon(_feed, rig, notifier, notifier.watchdog / LOOKS)
+            group.start_soon(_feed, rig, notifier, notifier.watchdog / CHECKS)
         try:
             await anyio.sleep_forever()
         finally:
@@ -49,7 +49,7 @@ async def serve_rig(config: str, path: Path, log_every: float) -> None:
 
 
 async def _reload(rig: LocalRig, door: NativeDoor, notifier: Notifier, asked: asyncio.Event) -> None:
-    """SIGHUP. A file that is wrong changes nothing, and is told."""
+    """Read the config again at each SIGHUP. A wrong file changes nothing and is logged."""
     while True:
         await asked.wait()
         asked.clear()
@@ -63,7 +63,7 @@ async def _reload(rig: LocalRig, door: NativeDoor, notifier: Notifier, asked: as
 
 
 async def _feed(rig: LocalRig, notifier: Notifier, period: float) -> None:
-    """The system's watchdog, as long as every bus goes on."""
+    """Feed the system's watchdog as long as every bus makes progress."""
     watchdog = Watchdog()
     while True:
         stuck = watchdog.stuck({name: _pulse(rig, name) for name in rig.buses})
@@ -83,12 +83,12 @@ def _pulse(rig: LocalRig, name: str) -> Pulse:
 async def _log_states(rig: LocalRig, every: float) -> None:
     while True:
         await anyio.sleep(every)
-        with suppress(KeyError):  # a bus that a reload is just taking away
+        with suppress(KeyError):  # a reload just removed the bus
             _log_state(rig)
 
 
 def _log_state(rig: LocalRig) -> None:
-    """One line for each bus."""
+    """Log one line for each bus."""
     stats, snapshot = rig.stats(), rig.snapshot()
     for bus, counts in stats.items():
         servos = {name.partition("/")[2]: state for name, state in snapshot.items() if rig.names[name][0] == bus}

@@ -1,4 +1,4 @@
-"""What systemd is told (sd_notify): a datagram of KEY=VALUE lines to the socket it names. Nothing, where nobody asks."""
+"""Messages to systemd (sd_notify): datagrams of KEY=VALUE lines to the socket that it names. Without a socket nothing is sent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from time import monotonic_ns
 
 
 class Notifier:
-    """`READY=1` once the doors are open, `STOPPING=1` at the end, `RELOADING=1` between, `WATCHDOG=1` while the buses go on."""
+    """`READY=1` once clients can connect, `RELOADING=1`, `STOPPING=1` at the end, `WATCHDOG=1` while every bus makes progress."""
 
     def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
         address = environ.get("NOTIFY_SOCKET", "")
@@ -18,23 +18,23 @@ class Notifier:
         ours = environ.get("WATCHDOG_PID") in (None, "", str(os.getpid()))
         usec = environ.get("WATCHDOG_USEC", "")
         self.watchdog = int(usec) / 1e6 if ours and usec.isdecimal() and int(usec) else None
-        """Seconds within which the system wants to hear WATCHDOG=1; None: it does not."""
+        """Seconds within which the system expects WATCHDOG=1; None: it does not."""
 
-    def tell(self, *lines: str) -> None:
-        """Never raises: a system that does not listen must not stop a robot."""
+    def send(self, *lines: str) -> None:
+        """Send lines. It never raises: a system that does not listen must not stop a robot."""
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             sender.sendto("\n".join(lines).encode(), self._address)
 
     def ready(self, status: str) -> None:
-        self.tell("READY=1", f"STATUS={status}")
+        self.send("READY=1", f"STATUS={status}")
 
     def reloading(self) -> None:
-        self.tell("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
+        self.send("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        self.tell("STOPPING=1")
+        self.send("STOPPING=1")
 
     def alive(self) -> None:
-        self.tell("WATCHDOG=1")
+        self.send("WATCHDOG=1")

@@ -1,4 +1,4 @@
-"""The sockets of the native door: a path that is ours alone, who is at the other end, and on TCP a token before a word."""
+"""The daemon's sockets: a path that is safe, the user at the other end, and tokens and TLS for TCP."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from servobus.config.access import TcpOptions
 from servobus.errors import AccessDenied, ConfigError, Overloaded, PortBusy
 
 GROUP = "servobus"
-"""Its members may open the socket, where the system has such a group."""
+"""Members of this group may open the socket, where the system has it."""
 FOLDER_MODE, SOCKET_UMASK = 0o750, 0o117
 CREDENTIALS = struct.Struct("3i")
 MIN_TOKEN = 32
 TRIES, WINDOW = 5, 60.0
-"""Wrong tokens of one address in so many seconds; then it waits that long."""
+"""Wrong tokens that one address may try within so many seconds."""
 BACKLOG = 1024
 MAX_PATH = 107
 """Bytes of a socket's path: sun_path of Linux, less its final zero."""
@@ -36,18 +36,18 @@ def peer_credentials(sock: socket.socket) -> tuple[int, int, int]:
 
 
 def claim(path: Path) -> socket.socket:
-    """Listen there. Raises PortBusy where a daemon does already, ConfigError where the place is not safe or its path too long."""
+    """Listen at a path. Raises PortBusy where a daemon listens already, ConfigError where the path is not safe or too long."""
     if len(os.fsencode(path)) > MAX_PATH:
         raise ConfigError(f"{path} has more than {MAX_PATH} bytes, too many for a socket: set SERVOBUS_SOCKET to a shorter path")
     _make_folder(path.parent)
     _remove_stale(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-    before = os.umask(SOCKET_UMASK)  # the file never exists with another mode
+    before = os.umask(SOCKET_UMASK)  # so that the file never has another mode
     try:
         listener.bind(str(path))
     except OSError as error:
         listener.close()
-        raise ConfigError(f"{path} cannot be made ({error.strerror}): set SERVOBUS_SOCKET to another place") from None
+        raise ConfigError(f"{path} cannot be made ({error.strerror or error}): set SERVOBUS_SOCKET to another path") from None
     finally:
         os.umask(before)
     with suppress(KeyError, PermissionError):
@@ -61,25 +61,25 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(mode=FOLDER_MODE, parents=True)
         with suppress(KeyError, PermissionError):
             os.chown(folder, -1, grp.getgrnam(GROUP).gr_gid)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
-        raise ConfigError(f"{folder} is no folder: remove it, or set SERVOBUS_SOCKET to another place")
-    if found.st_uid not in (0, os.geteuid()):
-        raise ConfigError(f"{folder} belongs to somebody else (uid {found.st_uid}): set SERVOBUS_SOCKET to another place")
-    if found.st_mode & stat.S_IWOTH:
-        raise ConfigError(f"everybody may write to {folder}, and put another socket there: chmod o-w, or choose another place")
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode):
+        raise ConfigError(f"{folder} is not a folder: remove it, or set SERVOBUS_SOCKET to another path")
+    if status.st_uid not in (0, os.geteuid()):
+        raise ConfigError(f"{folder} belongs to somebody else (uid {status.st_uid}): set SERVOBUS_SOCKET to another path")
+    if status.st_mode & stat.S_IWOTH:
+        raise ConfigError(f"everybody may write to {folder}, and replace the socket: chmod o-w, or choose another path")
 
 
 def _remove_stale(path: Path) -> None:
-    """The socket of a daemon that is gone. Raises where it is anything else."""
+    """Remove the socket of a daemon that has ended. Raises ConfigError and PortBusy where it is anything else."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISSOCK(found.st_mode):
-        raise ConfigError(f"{path} is there already and is no socket: look at it, and remove it")
-    if found.st_uid != os.geteuid():
-        raise ConfigError(f"{path} belongs to somebody else (uid {found.st_uid}): remove it, or choose another place")
+    if not stat.S_ISSOCK(status.st_mode):
+        raise ConfigError(f"{path} exists and is not a socket: look at it, and remove it")
+    if status.st_uid != os.geteuid():
+        raise ConfigError(f"{path} belongs to somebody else (uid {status.st_uid}): remove it, or choose another path")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
@@ -88,40 +88,40 @@ def _remove_stale(path: Path) -> None:
             path.unlink(missing_ok=True)
             return
         except OSError as error:
-            raise PortBusy(f"{path} does not answer ({error}): is a daemon hanging there?") from None
+            raise PortBusy(f"{path} does not answer ({error}): does a daemon hang there?") from None
         pid = peer_credentials(probe)[0]
     raise PortBusy(f"a servobus daemon (pid {pid}) listens at {path} already: use it, stop it, or set SERVOBUS_SOCKET")
 
 
 def inode(path: Path) -> int | None:
-    """What tells the socket there from another that took its place; None: there is none."""
+    """The inode of the socket at a path; None: there is none."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    return found.st_ino if stat.S_ISSOCK(found.st_mode) else None
+    return status.st_ino if stat.S_ISSOCK(status.st_mode) else None
 
 
 def remove(path: Path, own: int | None) -> None:
-    """At the end; somebody else's socket stays."""
+    """Remove our own socket at the end; the socket of another daemon stays."""
     if own is not None and inode(path) == own:
         path.unlink(missing_ok=True)
 
 
 class Tokens:
-    """The one token of a TCP door, and who may try how often. Times in seconds."""
+    """The token of a TCP daemon, and how often an address may try. Times in seconds."""
 
     def __init__(self, options: TcpOptions) -> None:
         self._digest = hashlib.sha256(read_token(Path(options.token_file))).digest()
         self._failures: dict[str, deque[float]] = {}
 
     def check(self, address: str, token: str | None, now: float) -> None:
-        """Raises AccessDenied, Overloaded."""
+        """Check a token. Raises AccessDenied, Overloaded."""
         failures = self._failures.setdefault(address, deque(maxlen=TRIES))
         if len(failures) == TRIES and now - failures[0] < WINDOW:
             raise Overloaded(f"too many wrong tokens from {address}: wait a minute")
-        said = hashlib.sha256((token or "").encode("utf-8", "surrogatepass")).digest()
-        if not hmac.compare_digest(said, self._digest):
+        digest = hashlib.sha256((token or "").encode("utf-8", "surrogatepass")).digest()
+        if not hmac.compare_digest(digest, self._digest):
             failures.append(now)
             if len(self._failures) > 4096:
                 self._failures.pop(next(iter(self._failures)))
@@ -130,7 +130,7 @@ class Tokens:
 
 
 def read_token(path: Path) -> bytes:
-    """Raises ConfigError for a file that others can read, or that holds too little."""
+    """The token of a file. Raises ConfigError for a file that others can read, or whose token is too short."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError as error:
@@ -149,7 +149,7 @@ def read_token(path: Path) -> bytes:
 
 
 def tls_context(options: TcpOptions) -> ssl.SSLContext | None:
-    """Raises ConfigError."""
+    """The TLS of a TCP daemon; None: it has none. Raises ConfigError."""
     if options.tls is None:
         return None
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)

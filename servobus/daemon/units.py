@@ -1,7 +1,6 @@
 """The files that make servobus a service of the system: a systemd unit, udev rules, and the user it runs as.
 
-The unit takes everything away that a daemon on serial lines does not need. It cannot have PrivateDevices, which would hide the
-ports.
+The unit removes all rights that a daemon on serial lines does not need, but not PrivateDevices: that would hide the ports.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ CONFIG = "/etc/servobus/servobus.yaml"
 UNIT = """\
 [Unit]
 Description=servobus, the owner of this robot's serial lines
-# A config that is wrong stays wrong: give up after a few starts and say so.
+# A wrong config stays wrong: give up after a few starts.
 StartLimitIntervalSec=30
 StartLimitBurst=10
 
@@ -25,9 +24,9 @@ ExecStart={command} run {config}
 ExecReload=kill -HUP $MAINPID
 Restart=on-failure
 RestartSec=200ms
-# A usage or config error is not healed by another start.
+# Another start does not help against a usage or config error.
 RestartPreventExitStatus=2
-# Fed while the buses go on, see servobus.daemon.watchdog.
+# Fed while every bus makes progress, see servobus.daemon.watchdog.
 WatchdogSec=5
 # SIGTERM applies each servo's on_exit; parking takes up to its park_timeout.
 TimeoutStopSec=15
@@ -83,12 +82,12 @@ UDEV = """\
 # Stable names for USB serial adapters: /dev/servobus/SERIAL, and -IFNN for adapters with several ports.
 ACTION!="remove", SUBSYSTEM=="tty", SUBSYSTEMS=="usb", ENV{ID_SERIAL}=="?*", ENV{ID_USB_INTERFACE_NUM}=="?*", \\
     SYMLINK+="servobus/$env{ID_SERIAL}-if$env{ID_USB_INTERFACE_NUM}"
-# FTDI adapters collect what they hear for 16 ms unless they are told not to.
+# FTDI adapters collect received bytes for 16 ms unless this is set.
 ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
 """
 
 SYSUSERS = """\
-# The daemon's user; whoever may talk to it belongs to its group.
+# The daemon's user; users who may connect belong to its group.
 u {user} - "servobus daemon" -
 """
 
@@ -98,12 +97,17 @@ AFTER = (
     "systemctl daemon-reload",
     "systemctl enable --now servobus",
 )
-"""What makes the files take effect."""
+"""Commands that make the files take effect."""
 
 
 def files(command: str, config: str = CONFIG, *, network: bool = False) -> dict[PurePosixPath, str]:
-    """Path on the system -> text. `command` is how servobus is started; `network`: the config has a TCP door, or lines that are
-    reached through TCP."""
+    """The files: path on the system -> text.
+
+    Args:
+        command: The command that starts servobus.
+        config: Path of the config.
+        network: The config has a TCP door, or lines that are reached by TCP.
+    """
     families = "AF_UNIX AF_INET AF_INET6" if network else "AF_UNIX"
     unit = UNIT.format(
         command=_quoted(command),
@@ -120,23 +124,23 @@ def files(command: str, config: str = CONFIG, *, network: bool = False) -> dict[
 
 
 def _quoted(text: str) -> str:
-    """As one word of a unit file."""
+    """Text as one word of a unit file."""
     text = text.replace("%", "%%").replace("$", "$$")
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"' if set(text) & set(" \t\"'\\") else text
 
 
 def write(texts: dict[PurePosixPath, str], root: Path, *, force: bool = False) -> list[Path]:
-    """Put them under `root`. Files of other content are kept unless `force`: FileExistsError, and nothing is written."""
-    places = {root / path.relative_to("/"): text for path, text in texts.items()}
-    others = [place for place, text in places.items() if place.exists() and place.read_text() != text]
+    """Write the files under `root`. Raises FileExistsError where one has other content, unless `force`."""
+    targets = {root / path.relative_to("/"): text for path, text in texts.items()}
+    others = [path for path, text in targets.items() if path.exists() and path.read_text() != text]
     if others and not force:
-        raise FileExistsError(f"{_listing(others)} holds something else: look at it, then give --force")
-    for place, text in places.items():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(text)
-        place.chmod(0o644)
-    return list(places)
+        raise FileExistsError(f"{_listing(others)} has other content: look at it, then give --force")
+    for path, text in targets.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        path.chmod(0o644)
+    return list(targets)
 
 
-def _listing(places: Sequence[Path]) -> str:
-    return ", ".join(map(str, places))
+def _listing(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))

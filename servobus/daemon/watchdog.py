@@ -1,5 +1,5 @@
-"""Whether the buses go on. The system's watchdog is fed by that, never by a timer alone: a daemon whose loop runs while a line
-stands still must be started anew."""
+"""Whether every bus makes progress. Only then the system's watchdog is fed: a daemon whose loop runs while a line
+is stuck must be started again."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One bus at one look."""
+    """The counters of one bus at one moment."""
 
     up: bool
     """The line is open."""
     frames: int
-    """Said so far."""
-    heard: int
-    """Bytes heard so far."""
+    """Frames sent so far."""
+    received: int
+    """Bytes received so far."""
     waiting: int
-    """What wants to be said."""
+    """Jobs that wait."""
 
 
 class Watchdog:
-    """Pure: looks at pulses, one look after another."""
+    """Compares the pulses of one moment with those of the last. Pure."""
 
     def __init__(self) -> None:
         self._last: Mapping[str, Pulse] = {}
 
     def stuck(self, pulses: Mapping[str, Pulse]) -> list[str]:
-        """The buses that had something to say at this look and at the last, and neither said nor heard anything between."""
+        """The buses that had jobs at both moments and neither sent nor received anything between."""
         last, self._last = self._last, dict(pulses)
         return [name for name, pulse in pulses.items() if name in last and self._is_stuck(last[name], pulse)]
 
     @staticmethod
     def _is_stuck(before: Pulse, now: Pulse) -> bool:
         wanted = before.up and now.up and before.waiting and now.waiting
-        return bool(wanted) and (before.frames, before.heard) == (now.frames, now.heard)
+        return bool(wanted) and (before.frames, before.received) == (now.frames, now.received)

@@ -1,4 +1,4 @@
-"""LocalRig: the rig whose ports this process owns. What becomes of one bus stands in `supervisor.py`."""
+"""LocalRig: the rig whose ports this process owns. `supervisor.py` opens and leaves each bus, `bus/` does the work on it."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from servobus.values import Change, EventName, Goal, Identity, Outcome, Reload, 
 
 R = TypeVar("R")
 QUIET = {EventName.LINE_UP, EventName.ECHO_PROBED, EventName.ESTOP_CLEARED, EventName.SERVO_ONLINE, EventName.RELOADED}
-"""Events that are no reason to look."""
+"""Events that are logged as information, the others as warnings."""
 
 log = EventLogger("servobus.rig")
 
 
 class LocalRig(Rig):
-    """Made by `servobus.open`, and alive as long as that context."""
+    """Made by `servobus.open`, and in use as long as that context."""
 
     def __init__(
         self,
@@ -44,9 +44,9 @@ class LocalRig(Rig):
     ) -> None:
         self.config = config
         self.path = path
-        """The file `reload` reads; None: there is none."""
+        """The file that `reload` reads; None: there is none."""
         self.left: dict[str, StopReport] = {}
-        """What became of each servo that was still enabled at the end, by full name; filled when the context has ended."""
+        """How each servo was left that was enabled at the end, by full name; filled when the context has ended."""
         self.event_source = EventSource()
         self._only = only
         self._trace = trace
@@ -54,29 +54,29 @@ class LocalRig(Rig):
         self._stopping: set[asyncio.Task[Any]] = set()
         self._reloading: asyncio.Task[Reload] | None = None
         self.supervisors = {name: self._supervisor(name, config) for name in only or config.buses}
-        self._know()
+        self._index()
 
     def _supervisor(self, name: str, config: Config) -> BusSupervisor:
         return BusSupervisor(name, config.buses[name], config.models[name], self._event, self._trace)
 
-    def _know(self) -> None:
-        """The names that go with the supervisors."""
+    def _index(self) -> None:
+        """The buses and names that belong to the supervisors."""
         self.buses: dict[str, BusService] = {name: supervisor.bus for name, supervisor in self.supervisors.items()}
-        self._names = {name: place for name, place in self.config.names.items() if place[0] in self.supervisors}
+        self._names = {name: pair for name, pair in self.config.names.items() if pair[0] in self.supervisors}
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
         return self._names
 
     def bus_of(self, name: str) -> tuple[BusService, str]:
-        """The bus and the bare name of a servo, by full or unique bare name. Raises UnknownName."""
+        """The bus and the bare name of the servo `name`. Raises UnknownName."""
         bus, servo = self._names.get(name) or self._names[self.full_name(name)]
         return self.buses[bus], servo
 
     # Lines
 
     async def start(self, *, degraded: bool) -> None:
-        """Until every line was tried. Raises the first LinkDown, unless `degraded`."""
+        """Open every line, or try to. Raises the first LinkDown, unless `degraded`."""
         for supervisor in self.supervisors.values():
             self._group.start_soon(supervisor.run, degraded)
         for supervisor in self.supervisors.values():
@@ -95,11 +95,11 @@ class LocalRig(Rig):
     async def reload(self) -> Reload:
         if self.path is None:
             raise NotSupported("this rig was not opened from a file, so there is none to read again")
-        config = load_config(self.path)  # an invalid file ends here, and nothing has changed
+        config = load_config(self.path)  # an invalid file raises here, before anything has changed
         if self._reloading is not None and not self._reloading.done():
-            raise Busy("the config is being read anew already: wait until that is done")
+            raise Busy("the config is being read again already: wait until that is done")
         self._reloading = asyncio.create_task(self._reload(config))
-        return await asyncio.shield(self._reloading)  # a caller that leaves does not stop it half-way
+        return await asyncio.shield(self._reloading)  # a caller that is cancelled does not stop it half-way
 
     async def _reload(self, config: Config) -> Reload:
         await asyncio.gather(*self._stopping)
@@ -111,7 +111,7 @@ class LocalRig(Rig):
         latched = self.stopped
         self.config = config
         self.supervisors = {name: self.supervisors[name] if name in kept else self._supervisor(name, config) for name in wanted}
-        self._know()
+        self._index()
         new = [name for name in wanted if name not in kept]
         for name in new:
             self.buses[name].motion.latched = latched
@@ -127,7 +127,7 @@ class LocalRig(Rig):
         await supervisor.close()
 
     async def leave(self) -> None:
-        """Exit policies, on all buses at once. `left` tells what became of each servo."""
+        """Apply the exit policies, on all buses at once; `left` then says how each servo was left."""
         reloading = () if self._reloading is None else (self._reloading,)
         await asyncio.gather(*self._stopping, *reloading, return_exceptions=True)
         self.left.update(await self._leave(self.supervisors.values()))
@@ -138,7 +138,7 @@ class LocalRig(Rig):
         return {name: report for part in reports for name, report in part.items()}
 
     async def close(self) -> None:
-        """Every line, once nobody opens them again."""
+        """Close every line, once nothing opens them again."""
         await asyncio.gather(*(supervisor.close() for supervisor in self.supervisors.values()))
 
     # Motion
@@ -166,7 +166,7 @@ class LocalRig(Rig):
 
     async def stop(self) -> dict[str, StopReport]:
         stopping = self._track(self._stop_all())
-        return await asyncio.shield(stopping)  # a caller that leaves does not end it
+        return await asyncio.shield(stopping)  # a caller that is cancelled does not end it
 
     async def _stop_all(self) -> dict[str, StopReport]:
         self._event(EventName.ESTOP)
@@ -176,19 +176,17 @@ class LocalRig(Rig):
         reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
         for supervisor, record in parking:
             self._track(supervisor.park(record))
-        return {
-            f"{bus}/{servo}": entry for bus, report in zip(self.buses, reports, strict=True) for servo, entry in report.items()
-        }
+        return {f"{bus}/{servo}": report for bus, part in zip(self.buses, reports, strict=True) for servo, report in part.items()}
 
-    def _track(self, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        task = asyncio.create_task(work)
+    def _track(self, coroutine: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
+        task = asyncio.create_task(coroutine)
         self._stopping.add(task)
         task.add_done_callback(self._stopping.discard)
         return task
 
     async def clear(self) -> None:
         if self._stopping:
-            raise Busy("servos are still being stopped or parked: clear when they stand")
+            raise Busy("servos are still being stopped or parked: clear when they are at rest")
         for bus in self.buses.values():
             bus.motion.latched = False
         self._event(EventName.ESTOP_CLEARED)
@@ -199,13 +197,18 @@ class LocalRig(Rig):
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
         full = self.full_names(names)
-        places = [self.bus_of(name) for name in full]
-        waits = (bus.motion.settle(servo, tolerance=tolerance, timeout=timeout) for bus, servo in places)
+        located = map(self.bus_of, full)
+        waits = (bus.motion.settle(servo, tolerance=tolerance, timeout=timeout) for bus, servo in located)
         return dict(zip(full, await asyncio.gather(*waits), strict=True))
 
     async def abandon(self, names: Iterable[str]) -> dict[str, StopReport]:
-        """Whoever moved these servos (full names) is gone: each that is enabled does its `on_lost_client`. Returns when that is
-        done, parking too."""
+        """Let servos do their `on_lost_client`, because the client that moved them is lost.
+
+        Args:
+            names: Full names; of these, the servos that are enabled.
+
+        Returns: What was done to each, by full name, once it is done, parking too.
+        """
         parts: dict[str, set[str]] = {}
         for name in names:
             bus, servo = self._names[name]
@@ -265,14 +268,16 @@ class LocalRig(Rig):
     ) -> list[ScanHit]:
         service = self._bus(bus)
         every = PROTOCOLS[service.options.protocol].scan_ids
-        found = []
-        async for asked, count, entry in scan(service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)):
-            hit = None if entry is None else ScanHit(bus, *entry)
+        hits = []
+        async for asked, count, identity in scan(
+            service, list(baudrates) or [service.options.baudrate], list(ids) or list(every)
+        ):
+            hit = None if identity is None else ScanHit(bus, *identity)
             if hit:
-                found.append(hit)
+                hits.append(hit)
             if progress:
                 progress(asked, count, hit)
-        return found
+        return hits
 
     async def set_id(self, bus: str, node: int, new: int, *, save: bool = False) -> Change:
         return await self._bus(bus).commission(node, lambda plans: plans.set_id(node, new, save=save))
@@ -292,7 +297,7 @@ class LocalRig(Rig):
         return {name: bus.snapshot() for name, bus in self.buses.items()}
 
     async def _each(self, names: Iterable[str], verb: Callable[[BusService, str], Awaitable[None]]) -> None:
-        """Every servo is tried, whatever happens to another."""
+        """Call the verb for every servo, whatever happens to another."""
         full = self.full_names(names)
         results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
         raise_failures(dict(zip(full, results, strict=True)))

@@ -1,4 +1,4 @@
-"""Waiting for several things at once, and for one that must not be cut short."""
+"""Results of several servos, and a coroutine that must run to its end."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from servobus.values import Outcome
 
 
 async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
-    """All of them, by name. Raises as `raise_failures`."""
+    """The outcomes of all, by name. Raises as `raise_failures`."""
     results = await asyncio.gather(*futures.values(), return_exceptions=True)
     named = dict(zip(futures, results, strict=True))
     raise_failures(named)
     return {name: result for name, result in named.items() if isinstance(result, Outcome)}
 
 
-async def uncancelled(work: Coroutine[Any, Any, None]) -> asyncio.CancelledError | None:
-    """Do it to its end, whoever cancels us meanwhile; returns the cancellation, to be raised when all is done."""
-    task, cancelled = asyncio.ensure_future(work), None
+async def uncancelled(coroutine: Coroutine[Any, Any, None]) -> asyncio.CancelledError | None:
+    """Run a coroutine to its end, even when the caller is cancelled. Returns that cancellation, to be raised later."""
+    task, cancelled = asyncio.ensure_future(coroutine), None
     with anyio.CancelScope(shield=True):
         while not task.done():
             try:
@@ -35,7 +35,7 @@ async def uncancelled(work: Coroutine[Any, Any, None]) -> asyncio.CancelledError
 
 
 def raise_failures(results: Mapping[str, Any]) -> None:
-    """One result raises its own error; several raise PartialFailure. What is no error of ours is raised as it is."""
+    """Raise PartialFailure for several results, and the error itself for one result or for an error that is not of servobus."""
     failures = [result for result in results.values() if isinstance(result, BaseException)]
     for failure in failures:
         if not isinstance(failure, ServobusError) or len(results) == 1:

@@ -1,1 +1,1 @@
-"""FLOOR 3: what the native door and its clients say to each other: JSON-RPC 2.0, one object a line."""
+"""The messages between a daemon and its clients: JSON-RPC 2.0, one object a line (docs/native-door.md)."""

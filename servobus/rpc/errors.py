@@ -1,5 +1,4 @@
-"""Errors on their way through a door: by the name of their class, with everything they carry, so that they are raised again at
-the other end as what they were."""
+"""Errors as messages: the name of the class and all attributes, so that a client raises what the daemon raised."""
 
 from __future__ import annotations
 
@@ -20,9 +19,9 @@ TYPES: dict[str, type[ServobusError]] = {
 
 
 def encoded(error: ServobusError) -> dict[str, Any]:
-    """As JSON-RPC has it: code, message for people, data for programs."""
-    known, *also = _known(type(error))
-    data: dict[str, Any] = {"type": known, "message": error.message} | ({"also": also} if also else {})
+    """The error as JSON-RPC has it: code, message for people, data for programs."""
+    first, *also = _public_kinds(type(error))
+    data: dict[str, Any] = {"type": first, "message": error.message} | ({"also": also} if also else {})
     data |= {key: value for key, value in (("bus", error.bus), ("servo", error.servo), ("raw", error.raw.hex())) if value}
     if isinstance(error, DeviceError) and error.code is not None:
         data["code"] = error.code
@@ -31,19 +30,19 @@ def encoded(error: ServobusError) -> dict[str, Any]:
     return {"code": FAILED, "message": str(error), "data": data}
 
 
-def _known(kind: type[ServobusError]) -> list[str]:
-    """The class of the tree that it is, or those that a finer kind of a protocol stands for."""
+def _public_kinds(kind: type[ServobusError]) -> list[str]:
+    """The most special classes of `errors.py` that the class is or inherits from; a protocol may have finer ones."""
     kinds = [base for base in kind.__mro__ if base in TYPES.values()]
     return [base.__name__ for base in kinds if not any(base is not other and issubclass(other, base) for other in kinds)]
 
 
 @functools.lru_cache(maxsize=256)
-def _kind(known: str, also: tuple[str, ...]) -> type[ServobusError]:
-    """The inverse."""
-    kinds = [TYPES[name] for name in dict.fromkeys((known, *also)) if name in TYPES] or [ServobusError]
+def _kind(first: str, also: tuple[str, ...]) -> type[ServobusError]:
+    """The class for the names that `_public_kinds` gave."""
+    kinds = [TYPES[name] for name in dict.fromkeys((first, *also)) if name in TYPES] or [ServobusError]
     try:
         return kinds[0] if len(kinds) == 1 else type(kinds[0].__name__, tuple(kinds), {})
-    except TypeError:  # they do not go together
+    except TypeError:  # these classes cannot be combined
         return kinds[0]
 
 
@@ -56,7 +55,7 @@ def _result(result: Any) -> Any:
 
 
 def decoded(error: Any) -> Exception:
-    """What to raise for the `error` of an answer; whatever it holds, an exception comes out."""
+    """The exception for the `error` of a reply, whatever it holds."""
     error = error if isinstance(error, dict) else {}
     message, code, data = str(error.get("message", "no reason given")), error.get("code"), error.get("data")
     if code == INVALID_PARAMS:
@@ -71,11 +70,11 @@ def decoded(error: Any) -> Exception:
         return PartialFailure(
             {name: _unresult(one) for name, one in results.items()} if isinstance(results, dict) else {}, **where
         )
-    said = str(data.get("message", message))
+    text = str(data.get("message", message))
     if issubclass(kind, DeviceError):
         number = data.get("code")
-        return kind(said, code=number if isinstance(number, int) else None, **where)
-    return kind(said, **where)
+        return kind(text, code=number if isinstance(number, int) else None, **where)
+    return kind(text, **where)
 
 
 def _bytes(text: Any) -> bytes:

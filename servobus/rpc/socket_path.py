@@ -1,4 +1,4 @@
-"""Where the daemon's socket is."""
+"""The path of the daemon's socket."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ FILE = "servobus.sock"
 
 
 def socket_path(environ: Mapping[str, str] = os.environ) -> Path:
-    """Where a daemon that is started now makes it."""
-    return _places(environ)[0]
+    """The path at which a daemon that starts now listens."""
+    return _paths(environ)[0]
 
 
 def find_socket(environ: Mapping[str, str] = os.environ) -> Path | None:
-    """Where one is: the user's own before the system's. None: nowhere."""
-    return next((place for place in _places(environ) if place.is_socket()), None)
+    """The path of a socket that exists: the user's before the system's; None: there is none."""
+    return next((path for path in _paths(environ) if path.is_socket()), None)
 
 
-def _places(environ: Mapping[str, str]) -> list[Path]:
-    """SERVOBUS_SOCKET alone where it is set; else the folder systemd made for the service, the user's, the system's."""
+def _paths(environ: Mapping[str, str]) -> list[Path]:
+    """SERVOBUS_SOCKET alone where it is set; else in the folder that systemd made, the user's, the system's."""
     if environ.get("SERVOBUS_SOCKET"):
         return [Path(environ["SERVOBUS_SOCKET"])]
-    places = [Path("/run/servobus") / FILE]
+    paths = [Path("/run/servobus") / FILE]
     if environ.get("XDG_RUNTIME_DIR"):
-        places.insert(0, Path(environ["XDG_RUNTIME_DIR"]) / "servobus" / FILE)
+        paths.insert(0, Path(environ["XDG_RUNTIME_DIR"]) / "servobus" / FILE)
     if environ.get("RUNTIME_DIRECTORY"):
-        places.insert(0, Path(environ["RUNTIME_DIRECTORY"].split(":")[0]) / FILE)
-    return places
+        paths.insert(0, Path(environ["RUNTIME_DIRECTORY"].split(":")[0]) / FILE)
+    return paths

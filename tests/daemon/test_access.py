@@ -262,7 +262,7 @@ def test_what_is_no_socket_is_left_alone(kind: str, tmp_path: Path) -> None:
         path.symlink_to(other)
     else:
         path.mkdir()
-    with pytest.raises(ConfigError, match="is no socket"):
+    with pytest.raises(ConfigError, match="is not a socket"):
         claim(path)
     assert other.read_text() == "mine"
     assert path.exists()
@@ -280,7 +280,7 @@ def test_a_folder_that_is_open_to_all_is_refused(mode: int, tmp_path: Path) -> N
 def test_a_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "run").symlink_to(tmp_path / "real")
-    with pytest.raises(ConfigError, match="is no folder"):
+    with pytest.raises(ConfigError, match="is not a folder"):
         claim(tmp_path / "run" / "s")
 
 

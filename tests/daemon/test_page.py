@@ -1,4 +1,4 @@
-"""The page of the native door: its examples, word by word, over a real socket."""
+"""The page of the daemon's protocol: its examples, letter by letter, over a real socket."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RIG = "shoulder: {id: 1, model: sts, on_estop: hold}", "elbow: {id: 2, model: st
 
 
 def test_it_has_examples() -> None:
-    assert [title for title, _ in EXAMPLES] == ["Asking", "Moving", "Stopping", "Errors", "Subscriptions"]
+    assert [title for title, _ in EXAMPLES] == ["Reading", "Moving", "Stopping", "Errors", "Subscriptions"]
 
 
 @pytest.mark.parametrize(("title", "text"), EXAMPLES)

@@ -6,7 +6,7 @@ import pytest
 
 from servobus.daemon.watchdog import Pulse, Watchdog
 
-GOING = Pulse(up=True, frames=10, heard=100, waiting=3)
+GOING = Pulse(up=True, frames=10, received=100, waiting=3)
 
 
 def looks(*pulses: Pulse) -> list[str]:
@@ -25,14 +25,14 @@ def test_something_waits_and_nothing_happens() -> None:
     "pulses",
     [
         (GOING,),
-        (GOING, Pulse(up=True, frames=11, heard=100, waiting=3)),
-        (GOING, Pulse(up=True, frames=10, heard=101, waiting=3)),
-        (GOING, Pulse(up=True, frames=10, heard=100, waiting=0)),
-        (Pulse(up=True, frames=10, heard=100, waiting=0), GOING),
-        (GOING, Pulse(up=False, frames=10, heard=100, waiting=3)),
-        (Pulse(up=False, frames=10, heard=100, waiting=3), GOING),
+        (GOING, Pulse(up=True, frames=11, received=100, waiting=3)),
+        (GOING, Pulse(up=True, frames=10, received=101, waiting=3)),
+        (GOING, Pulse(up=True, frames=10, received=100, waiting=0)),
+        (Pulse(up=True, frames=10, received=100, waiting=0), GOING),
+        (GOING, Pulse(up=False, frames=10, received=100, waiting=3)),
+        (Pulse(up=False, frames=10, received=100, waiting=3), GOING),
     ],
-    ids=["first look", "said", "heard", "idle now", "idle before", "down now", "down before"],
+    ids=["first look", "said", "received", "idle now", "idle before", "down now", "down before"],
 )
 def test_it_goes_on(pulses: tuple[Pulse, ...]) -> None:
     assert looks(*pulses) == []
