@@ -98,10 +98,10 @@ def test_a_rig_of_its_own() -> None:
         rig.enable()
         assert rig["s1"].move_to(3) is Outcome.ACKED
         assert rig["s1"].settle().position == pytest.approx(3, abs=0.9)
-        seen: list[int] = []
+        asked_ids: list[int] = []
         rig.disable()
-        assert [hit.id for hit in rig.scan("arm", ids=[2], progress=lambda asked, count, hit: seen.append(asked))] == [2]
-        assert seen == [1]
+        assert [hit.id for hit in rig.scan("arm", ids=[2], progress=lambda asked, count, hit: asked_ids.append(asked))] == [2]
+        assert asked_ids == [1]
 
 
 def test_signatures_are_those_of_the_rig() -> None:
@@ -148,7 +148,7 @@ def test_several_threads(tmp_path: Path) -> None:
         wrong: list[int | None] = []
 
         def ping(number: int) -> None:
-            wrong.extend(said for _ in range(50) if (said := rig.ping(f"s{number}")) != number)
+            wrong.extend(reply for _ in range(50) if (reply := rig.ping(f"s{number}")) != number)
 
         callers = [threading.Thread(target=ping, args=(1 + number % 2,)) for number in range(8)]
         for caller in callers:

@@ -25,7 +25,7 @@ class Raw:
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
         self.writer = writer
-        self.told: list[Any] = []
+        self.notices: list[Any] = []
         self._numbers = itertools.count(1)
 
     def say(self, data: bytes) -> None:
@@ -48,7 +48,7 @@ class Raw:
         while True:
             message = await self.line()
             if "method" in message:
-                self.told.append(message)
+                self.notices.append(message)
             elif message["id"] == number:
                 return message["result"] if "result" in message else message["error"].get("data", message["error"])
 

@@ -60,13 +60,13 @@ def test_every_method_has_its_role_and_its_verb() -> None:
 @virtual
 async def test_every_method_by_every_role(role: Role, tmp_path: Path) -> None:
     async with served(tmp_path, clients_per_user=100) as (_, door, path):
-        for method, known in METHODS.items():
+        for method, row in METHODS.items():
             async with dialled(path) as raw:
                 await raw.call("stopped")
                 list(door.connections)[-1].role = role
                 answer = await raw.call(method, **EXAMPLES.get(method, {}))
                 denied = isinstance(answer, dict) and answer.get("type") == "AccessDenied"
-                assert denied is (role < known.role), f"{method} as {role}: {answer}"
+                assert denied is (role < row.role), f"{method} as {role}: {answer}"
 
 
 @virtual
@@ -151,11 +151,11 @@ def token_file(folder: Path, text: str = TOKEN, mode: int = 0o600) -> Path:
     return path
 
 
-@pytest.mark.parametrize("said", [None, "", " ", TOKEN[:-1], TOKEN + "x", TOKEN.upper(), "ключ" * 10, "\ud800"])
-def test_tokens_that_are_not_the_one(said: str | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("token", [None, "", " ", TOKEN[:-1], TOKEN + "x", TOKEN.upper(), "ключ" * 10, "\ud800"])
+def test_tokens_that_are_not_the_one(token: str | None, tmp_path: Path) -> None:
     tokens = Tokens(TcpOptions(port=0, token_file=str(token_file(tmp_path))))
     with pytest.raises(AccessDenied) as caught:
-        tokens.check("a", said, 0.0)
+        tokens.check("a", token, 0.0)
     assert TOKEN not in str(caught.value)
     tokens.check("a", TOKEN, 0.0)
 
@@ -216,14 +216,14 @@ async def test_tcp_shows_its_token_first(tmp_path: Path, capsys: pytest.CaptureF
         assert (await raw.call("reload"))["type"] == "AccessDenied"
         everything = str(await raw.call("config")) + str(await raw.call("stats")) + str(door.options)
         await raw.close()
-    told = capsys.readouterr()
-    assert TOKEN not in everything + told.out + told.err
+    printed = capsys.readouterr()
+    assert TOKEN not in everything + printed.out + printed.err
 
 
-# The place of the socket
+# The path of the socket
 
 
-def test_a_new_place_is_ours_alone(tmp_path: Path) -> None:
+def test_a_new_folder_is_ours_alone(tmp_path: Path) -> None:
     path = tmp_path / "run" / "servobus.sock"
     with claim(path):
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o750
@@ -239,7 +239,7 @@ def test_a_socket_path_that_is_too_long(tmp_path: Path) -> None:
         assert longest.is_socket()
 
 
-def test_a_second_daemon_is_told_of_the_first(tmp_path: Path) -> None:
+def test_a_second_daemon_names_the_first(tmp_path: Path) -> None:
     path = tmp_path / "s"
     with claim(path), pytest.raises(PortBusy, match=rf"daemon \(pid {os.getpid()}\) listens at .* already: use it, stop it"):
         claim(path)

@@ -36,15 +36,15 @@ def polls(client: socket.socket) -> int | None:
     """What the bus has polled so far, as the daemon answers; None: it hangs up."""
     try:
         client.sendall(b'{"jsonrpc":"2.0","id":1,"method":"stats"}\n')
-        heard = b""
-        while not heard.endswith(b"\n"):
+        received = b""
+        while not received.endswith(b"\n"):
             piece = client.recv(65536)
             if not piece:
                 return None
-            heard += piece
+            received += piece
     except ConnectionError:
         return None
-    counts: int = json.loads(heard)["result"]["arm"].get("polled", 0)
+    counts: int = json.loads(received)["result"]["arm"].get("polled", 0)
     return counts
 
 

@@ -28,5 +28,5 @@ async def test_example(title: str, text: str, tmp_path: Path) -> None:
             if line.startswith("-> "):
                 raw.say(line[3:].encode() + b"\n")
                 continue
-            said = (await raw.reader.readline()).decode().rstrip()
-            assert re.fullmatch(re.escape(line[3:]).replace(re.escape("..."), ".+?"), said), f"{title}: {said}"
+            reply = (await raw.reader.readline()).decode().rstrip()
+            assert re.fullmatch(re.escape(line[3:]).replace(re.escape("..."), ".+?"), reply), f"{title}: {reply}"

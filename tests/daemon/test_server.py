@@ -46,7 +46,7 @@ BAD: list[tuple[bytes, int]] = [
 
 @pytest.mark.parametrize(("line", "code"), BAD)
 @virtual
-async def test_what_is_no_call_is_refused_and_the_next_is_heard(line: bytes, code: int, tmp_path: Path) -> None:
+async def test_a_wrong_call_is_refused_and_the_next_is_done(line: bytes, code: int, tmp_path: Path) -> None:
     async with served(tmp_path) as (_, _, path), dialled(path) as raw:
         raw.say(line)
         answer = await raw.line()
@@ -90,7 +90,7 @@ async def test_batches_positions_notifications_and_ids(tmp_path: Path) -> None:
         assert answers[1]["result"] == 1
         assert answers[3]["error"]["data"]["type"] == "UnknownName"
         raw.say(b'{"jsonrpc":"2.0","method":"clear"}\n\n')
-        assert (await raw.call("names")) == {name: list(place) for name, place in rig.names.items()}
+        assert (await raw.call("names")) == {name: list(position) for name, position in rig.names.items()}
 
 
 # Stops and leases
@@ -107,7 +107,7 @@ async def test_a_stop_goes_before_everything_that_came_with_it(tmp_path: Path) -
         assert sorted(order) == sorted([*flood, stop])
         assert order.index(stop) < 60, "it did not wait for the flood"
         report = next(answer["result"] for answer in answers if answer["id"] == stop)
-        assert all(entry["written"] and entry["confirmed"] for entry in report.values())
+        assert all(servo["written"] and servo["confirmed"] for servo in report.values())
         assert rig.stopped
 
 
@@ -126,11 +126,11 @@ async def test_stops_and_renewals_wait_for_no_call_under_way(tmp_path: Path) -> 
             assert lease["names"] == ["arm/s1"]
         assert (rig.snapshot()["arm/s1"].position or 0) > 20, "its lease held over more than its time"
         raw.say(json.dumps([{"jsonrpc": "2.0", "id": 0, "method": method} for method in ("names", "stop")]).encode() + b"\n")
-        told = await raw.line()
-        while not isinstance(told, list):
-            assert told["id"] != late
-            told = await raw.line()
-        assert told[1]["result"]["arm/s1"]["confirmed"]
+        message = await raw.line()
+        while not isinstance(message, list):
+            assert message["id"] != late
+            message = await raw.line()
+        assert message[1]["result"]["arm/s1"]["confirmed"]
 
 
 @virtual
@@ -156,7 +156,7 @@ async def test_who_leaves_in_the_middle_of_a_batch(tmp_path: Path) -> None:
 
 
 @virtual
-async def test_a_lease_is_taken_by_moving_and_others_are_told_who_has_it(tmp_path: Path) -> None:
+async def test_a_lease_is_taken_by_moving_and_names_its_holder(tmp_path: Path) -> None:
     async with served(tmp_path, config(*SLOW)) as (_, _, path), dialled(path) as one, dialled(path) as two:
         await one.call("hello", client="arm script\x1b[2J")
         await one.call("enable")
@@ -177,7 +177,7 @@ async def test_a_lease_is_taken_by_moving_and_others_are_told_who_has_it(tmp_pat
 
 
 @virtual
-async def test_an_expired_lease_stops_its_servos_and_old_goals_move_nothing(tmp_path: Path) -> None:
+async def test_an_expired_lease_stops_servos_and_refuses_old_goals(tmp_path: Path) -> None:
     async with served(tmp_path, config(*SLOW), lease_ms=300) as (rig, _, path), dialled(path) as raw, dialled(path) as other:
         await raw.call("enable")
         watching = await other.call("subscribe", topic="events")
@@ -192,13 +192,13 @@ async def test_an_expired_lease_stops_its_servos_and_old_goals_move_nothing(tmp_
         assert (await raw.call("acquire", names=["s1"]))["lease_ms"] == 300
         assert await raw.call("move_to", name="s1", position=80) == "acked"
         await other.call("stopped")
-        events = [note["params"]["name"] for note in other.told if note["params"]["subscription"] == watching]
+        events = [note["params"]["name"] for note in other.notices if note["params"]["subscription"] == watching]
         assert events == ["lease_lost"]
 
 
-@pytest.mark.parametrize(("end", "place"), [("released", 40), ("renewed", 40), ("gone", 12)])
+@pytest.mark.parametrize(("end", "position"), [("released", 40), ("renewed", 40), ("gone", 12)])
 @virtual
-async def test_how_motion_ends(end: str, place: float, tmp_path: Path) -> None:
+async def test_how_motion_ends(end: str, position: float, tmp_path: Path) -> None:
     async with served(tmp_path, config(*SLOW), lease_ms=200) as (rig, door, path):
         async with dialled(path) as raw:
             await raw.call("enable")
@@ -210,12 +210,12 @@ async def test_how_motion_ends(end: str, place: float, tmp_path: Path) -> None:
                 if end != "released":
                     await raw.call("renew")
         await asyncio.sleep(3)
-        assert (await rig.read("s1")).position == pytest.approx(place, abs=6)
+        assert (await rig.read("s1")).position == pytest.approx(position, abs=6)
         assert door.leases.holders() == {}
 
 
 @virtual
-async def test_a_name_said_by_another_does_not_bring_his_lease(tmp_path: Path) -> None:
+async def test_the_name_of_another_client_does_not_bring_its_lease(tmp_path: Path) -> None:
     async with served(tmp_path, config(*SLOW)) as (_, _, path), dialled(path) as one, dialled(path) as two:
         for client in (one, two):
             await client.call("hello", client="arm script")

@@ -23,9 +23,9 @@ async def test_states_come_at_their_rate_and_only_what_was_asked_for(tmp_path: P
         number = await raw.call("subscribe", topic="state", hz=10, names=["s1"], fields=["position", "health"])
         await asyncio.sleep(2)
         assert await raw.call("unsubscribe", subscription=number) is None
-        told = [note["params"] for note in raw.told]
-        assert 18 <= len(told) <= 22
-        assert told[0] == {
+        notices = [note["params"] for note in raw.notices]
+        assert 18 <= len(notices) <= 22
+        assert notices[0] == {
             "subscription": number,
             "missed": 0,
             "stopped": False,
@@ -59,7 +59,7 @@ async def test_there_is_an_end_to_subscriptions(tmp_path: Path) -> None:
 
 
 @virtual
-async def test_one_who_does_not_read_is_told_what_he_missed_and_left_at_last(tmp_path: Path) -> None:
+async def test_a_client_that_does_not_read_sees_what_it_missed(tmp_path: Path) -> None:
     async with served(tmp_path) as (_, door, path):
         async with dialled(path) as raw:
             for _ in range(8):
@@ -84,14 +84,14 @@ async def test_one_above_his_rate_is_read_more_slowly_and_loses_nothing(tmp_path
 
 
 @virtual
-async def test_there_is_an_end_to_what_may_wait_and_nothing_of_it_is_lost(tmp_path: Path) -> None:
+async def test_waiting_calls_are_bounded_and_none_is_lost(tmp_path: Path) -> None:
     async with served(tmp_path, rate=1000) as (_, door, path), dialled(path) as raw:
         numbers = [raw.ask("read", name="s1", max_age=3600) for _ in range(8000)]
-        most = 0
+        waiting = 0
         for number in numbers:
             assert (await raw.line())["id"] == number
-            most = max(most, next(iter(door.connections))._waiting)
-        assert MAX_WAITING / 2 < most < 3 * MAX_WAITING, "one more piece of the socket may be read before it rests"
+            waiting = max(waiting, next(iter(door.connections))._waiting)
+        assert MAX_WAITING / 2 < waiting < 3 * MAX_WAITING, "one more piece of the socket may be read before it rests"
         assert not next(iter(door.connections))._waiting
 
 
@@ -114,6 +114,6 @@ async def test_health_and_config_tell_no_secret(tmp_path: Path) -> None:
     async with served(tmp_path) as (_, _, path), dialled(path) as raw:
         health = await raw.call("health")
         assert (health["ok"], health["buses"]) == (True, {"arm": True})
-        told = await raw.call("config")
-        assert set(told) == {"version", "buses"}
-        assert told["buses"]["arm"]["servos"]["s1"]["limits"] == [-90.0, 90.0]
+        notices = await raw.call("config")
+        assert set(notices) == {"version", "buses"}
+        assert notices["buses"]["arm"]["servos"]["s1"]["limits"] == [-90.0, 90.0]

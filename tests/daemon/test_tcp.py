@@ -24,14 +24,14 @@ def tcp(folder: Path, certificate: Certificate | None = None) -> TcpOptions:
 
 async def test_a_rig_through_tls(tmp_path: Path, certificate: Certificate) -> None:
     async with served(tmp_path, tcp=tcp(tmp_path, certificate)) as (_, door, _):
-        place = door.addresses[1]
-        async with servobus.connect(place, token=TOKEN, tls=certificate[0]) as rig:
+        address = door.addresses[1]
+        async with servobus.connect(address, token=TOKEN, tls=certificate[0]) as rig:
             await rig.enable("s1")
             await rig.move({"s1": 10})
             assert (await rig.settle("s1"))["arm/s1"].position == pytest.approx(10, abs=0.2)
             await rig.disable("s1")
         with pytest.raises(AccessDenied, match="token"):
-            async with servobus.connect(place, token=TOKEN[::-1], tls=certificate[0]):
+            async with servobus.connect(address, token=TOKEN[::-1], tls=certificate[0]):
                 pass
 
 

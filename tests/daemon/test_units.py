@@ -46,8 +46,8 @@ def test_any_path_is_one_word(word: str, written: str) -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
 def test_systemd_finds_it_safe(tmp_path: Path) -> None:
-    places = units.write(units.files("/bin/true"), tmp_path)
-    path = next(place for place in places if place.suffix == ".service")
+    paths = units.write(units.files("/bin/true"), tmp_path)
+    path = next(path for path in paths if path.suffix == ".service")
     command = ["systemd-analyze", "security", "--offline=true", "--threshold=20", str(path)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
@@ -90,7 +90,7 @@ def test_a_config_that_is_wrong_is_not_installed(tmp_path: Path) -> None:
     assert not (tmp_path / "root").exists()
 
 
-def test_a_config_that_is_not_there_yet_is_said(tmp_path: Path) -> None:
+def test_a_config_that_does_not_exist_yet_is_named(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["install-service", str(tmp_path / "later.yaml")])
     assert result.exit_code == 0
     assert "does not exist yet" in result.output

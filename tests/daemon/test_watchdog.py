@@ -11,10 +11,10 @@ GOING = Pulse(up=True, frames=10, received=100, waiting=3)
 
 def looks(*pulses: Pulse) -> list[str]:
     watchdog = Watchdog()
-    found: list[str] = []
+    stuck_buses: list[str] = []
     for pulse in pulses:
-        found = watchdog.stuck({"arm": pulse})
-    return found
+        stuck_buses = watchdog.stuck({"arm": pulse})
+    return stuck_buses
 
 
 def test_something_waits_and_nothing_happens() -> None:

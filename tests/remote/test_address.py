@@ -31,7 +31,7 @@ async def tcp_daemon(tls: ssl.SSLContext | None = None) -> AsyncIterator[tuple[P
 
 
 async def test_tcp() -> None:
-    async with tcp_daemon() as (daemon, place), connect(place, token="x" * 32) as rig:
+    async with tcp_daemon() as (daemon, address), connect(address, token="x" * 32) as rig:
         assert await rig.ping("s1") == 5
         assert daemon.calls("hello")[0]["token"] == "x" * 32
         daemon.visitor.transport.abort()
@@ -40,27 +40,27 @@ async def test_tcp() -> None:
 
 
 async def test_nobody_listens() -> None:
-    async with tcp_daemon() as (_, place):
+    async with tcp_daemon() as (_, address):
         pass
     with pytest.raises(LinkDown, match=r"no daemon listens at tcp://127.*servobus run"):
-        async with connect(place):
+        async with connect(address):
             pass
 
 
 async def test_tls(certificate: tuple[Path, Path]) -> None:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(*certificate)
-    async with tcp_daemon(context) as (_, place):
-        async with connect(place, tls=certificate[0]) as rig:
+    async with tcp_daemon(context) as (_, address):
+        async with connect(address, tls=certificate[0]) as rig:
             assert await rig.ping("s1") == 5
         with pytest.raises(LinkDown, match="certificate"):  # signed by nobody this machine knows
-            async with connect(place, tls=True):
+            async with connect(address, tls=True):
                 pass
 
 
 async def test_tls_with_a_daemon_that_has_none() -> None:
-    async with tcp_daemon() as (daemon, place):
+    async with tcp_daemon() as (daemon, address):
         daemon.answers.clear()
         with pytest.raises(LinkDown):
-            async with connect(place, tls=True):
+            async with connect(address, tls=True):
                 pass

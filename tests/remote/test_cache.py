@@ -28,7 +28,7 @@ def test_a_snapshot_has_every_name_and_the_age_of_the_moment() -> None:
     assert cache.snapshot(102.0)["arm/b"] == State(position=2.0, time=103.0, age=0.0)
 
 
-def test_without_a_daemon_everything_is_offline_and_figures_are_none() -> None:
+def test_without_a_daemon_all_is_offline_without_figures() -> None:
     cache = StateCache()
     cache.names = NAMES
     cache.put({"arm/b": State(position=1.0, time=99.0, health=Health.ONLINE)})

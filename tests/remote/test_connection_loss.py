@@ -27,7 +27,7 @@ from tests.waiting import ACKED, LEASE, until
 
 
 @virtual
-async def test_a_lost_connection_fails_what_is_under_way_and_repeats_nothing(tmp_path: Path) -> None:
+async def test_a_lost_connection_fails_calls_and_repeats_none(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         daemon.answers["send_all"] = lambda visitor, _: visitor.transport.abort()
         with pytest.raises(LinkDown, match="send_all was under way and may have been applied"):
@@ -51,7 +51,7 @@ async def test_a_lost_connection_fails_what_is_under_way_and_repeats_nothing(tmp
 async def test_it_is_tried_more_and_more_rarely(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         events: list[Event] = []
-        listening = asyncio.create_task(listen(rig, events))
+        reading = asyncio.create_task(listen(rig, events))
         await asyncio.sleep(0.1)
         daemon.answers["hello"] = failed("AccessDenied", "not today")
         daemon.visitor.transport.abort()
@@ -63,7 +63,7 @@ async def test_it_is_tried_more_and_more_rarely(tmp_path: Path) -> None:
         await asyncio.sleep(2.1)
         daemon.visitor.notify("events", name="estop", time=1.0, fields={})
         await asyncio.sleep(0.1)
-        listening.cancel()
+        reading.cancel()
     assert [event.name for event in events] == ["daemon_lost", "daemon_back", "estop"]
 
 
@@ -75,14 +75,14 @@ async def listen(rig: RemoteRig, events: list[Event]) -> None:
 @virtual
 async def test_watching_goes_on(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
-        seen = []
+        states = []
 
         async def watch() -> None:
             async for snapshot in rig.watch(hz=50):
-                seen.append((snapshot["arm/s1"].position, snapshot["arm/s1"].health))  # noqa: PERF401 - it never ends
+                states.append((snapshot["arm/s1"].position, snapshot["arm/s1"].health))  # noqa: PERF401 - it never ends
 
         watching = asyncio.create_task(watch())
-        await until(lambda: seen)
+        await until(lambda: states)
         assert {"topic": "state", "hz": 50} in daemon.calls("subscribe")
         for position in range(3):  # a slow reader gets the newest
             daemon.visitor.notify("state", stopped=False, states={"arm/s1": STATE | {"position": position}, "arm/s2": STATE})
@@ -94,7 +94,7 @@ async def test_watching_goes_on(tmp_path: Path) -> None:
         watching.cancel()
         await asyncio.sleep(0.1)
         assert len(daemon.calls("unsubscribe")) == 1
-    assert seen == [(1.5, "online"), (2, "online"), (2, "offline"), (9, "online")]
+    assert states == [(1.5, "online"), (2, "online"), (2, "offline"), (9, "online")]
 
 
 @virtual
@@ -120,7 +120,7 @@ async def test_names_follow_a_reload_by_somebody_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "told"),
+    ("method", "params"),
     [
         ("state", {}),
         ("state", {"stopped": False, "states": 1}),
@@ -132,16 +132,16 @@ async def test_names_follow_a_reload_by_somebody_else(tmp_path: Path) -> None:
     ],
 )
 @virtual
-async def test_a_notice_that_is_none_ends_the_connection(tmp_path: Path, method: str, told: dict[str, Any]) -> None:
+async def test_a_notice_that_is_none_ends_the_connection(tmp_path: Path, method: str, params: dict[str, Any]) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         events: list[Event] = []
-        listening = asyncio.create_task(listen(rig, events))
+        reading = asyncio.create_task(listen(rig, events))
         await asyncio.sleep(0.1)
         for number in range(5):
-            daemon.visitor.say({"method": method, "params": told | {"subscription": number}})
+            daemon.visitor.say({"method": method, "params": params | {"subscription": number}})
         await until(lambda: len(daemon.visitors) == 2)
         await asyncio.sleep(0.1)
-        listening.cancel()
+        reading.cancel()
         assert [event.name for event in events] == ["daemon_lost", "daemon_back"]
         assert "another version" in str(events[0].fields["reason"])
 

@@ -56,7 +56,7 @@ def test_what_was_refused_needs_a_new_wish() -> None:
     assert mine.to_acquire([A, B], 10.1) == {A}
 
 
-def test_what_was_given_back_or_held_through_another_connection_is_no_loss() -> None:
+def test_neither_a_release_nor_a_new_connection_is_a_loss() -> None:
     mine = leases()
     mine.taken([A, B], 10.0)
     mine.released([A])

@@ -51,12 +51,12 @@ async def test_what_is_there_is_no_socket(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "place", ["http://host:1", "tcp://host", "tcp://:80", "tcp://localhost:99999", "tcp://localhost:1/x", "tcp://u@localhost:1"]
+    "address", ["http://host:1", "tcp://host", "tcp://:80", "tcp://localhost:99999", "tcp://localhost:1/x", "tcp://u@localhost:1"]
 )
 @virtual
-async def test_an_address_that_is_none(place: str) -> None:
+async def test_an_address_that_is_none(address: str) -> None:
     with pytest.raises(ConfigError, match="tcp://host:port"):
-        async with connect(place):
+        async with connect(address):
             pass
 
 
@@ -132,7 +132,7 @@ async def test_what_answers_talks_nonsense(tmp_path: Path, babble: bytes) -> Non
 
 
 @virtual
-async def test_a_connection_refused_in_words(tmp_path: Path) -> None:
+async def test_a_connection_refused_with_an_error(tmp_path: Path) -> None:
     def answer(visitor: Visitor, _: dict[str, Any]) -> None:
         visitor.say({"id": None, **failed("Overloaded", "1000 clients are connected already")})
         visitor.transport.close()
@@ -177,7 +177,7 @@ async def test_an_answer_about_another_servo_is_none(tmp_path: Path) -> None:
 
 
 @virtual
-async def test_a_daemon_that_hangs_costs_a_call_its_deadline_and_no_more(tmp_path: Path) -> None:
+async def test_a_daemon_that_hangs_costs_a_call_its_deadline(tmp_path: Path) -> None:
     asked: list[int] = []
 
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
@@ -206,10 +206,10 @@ async def test_a_scan_goes_on_as_long_as_it_reports(tmp_path: Path) -> None:
         scans.append(message["id"])
 
     scans: list[int] = []
-    seen: list[tuple[int, int]] = []
+    reports: list[tuple[int, int]] = []
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         daemon.answers["scan"] = answer
-        scan = asyncio.create_task(rig.scan("arm", progress=lambda asked, count, _: seen.append((asked, count))))
+        scan = asyncio.create_task(rig.scan("arm", progress=lambda asked, count, _: reports.append((asked, count))))
         for asked in range(4):
             await alive(daemon, 20)
             progress = {"id": scans[0], "bus": "arm", "asked": asked, "count": 4, "found": None}
@@ -217,7 +217,7 @@ async def test_a_scan_goes_on_as_long_as_it_reports(tmp_path: Path) -> None:
         daemon.visitor.say({"id": scans[0], "result": [{"bus": "arm", "id": 1, "baudrate": 5, "model": "sts"}]})
         with pytest.raises(LinkDown, match="another version"):  # a ScanHit has more fields
             await scan
-    assert seen == [(0, 4), (1, 4), (2, 4), (3, 4)]
+    assert reports == [(0, 4), (1, 4), (2, 4), (3, 4)]
 
 
 @virtual

@@ -178,10 +178,10 @@ def gimbal() -> Config:
 async def test_scanning(over: Over, tmp_path: Path) -> None:
     async with over(config(), tmp_path) as (rig, _):
         progress: list[tuple[int, int, ScanHit | None]] = []
-        found = await rig.scan("arm", ids=range(4), progress=lambda *told: progress.append(told))
-        assert [(hit.id, hit.model, hit.baudrate) for hit in found] == [(number, "sts", 1000000) for number in (1, 2, 3)]
-        assert all(isinstance(hit, ScanHit) for hit in found)
-        assert progress == list(zip(range(1, 5), [4] * 4, [None, *found], strict=True))
+        hits = await rig.scan("arm", ids=range(4), progress=lambda *report: progress.append(report))
+        assert [(hit.id, hit.model, hit.baudrate) for hit in hits] == [(number, "sts", 1000000) for number in (1, 2, 3)]
+        assert all(isinstance(hit, ScanHit) for hit in hits)
+        assert progress == list(zip(range(1, 5), [4] * 4, [None, *hits], strict=True))
         assert len(await rig.scan("arm")) == 3
         with pytest.raises(UnknownName, match="arm"):
             await rig.scan("leg")

@@ -203,13 +203,13 @@ async def test_leases_that_nobody_contests(over: Over, tmp_path: Path) -> None:
 @virtual
 async def test_events(over: Over, tmp_path: Path) -> None:
     async with over(config(poll="{feedback: 50}"), tmp_path) as (rig, home):
-        heard = []
+        events = []
 
-        async def listen() -> None:
+        async def read_events() -> None:
             async for event in rig.events():
-                heard.append(event)  # noqa: PERF401 - it never ends
+                events.append(event)  # noqa: PERF401 - it never ends
 
-        listening = asyncio.create_task(listen())
+        reading = asyncio.create_task(read_events())
         await asyncio.sleep(0.1)
         begun = asyncio.get_running_loop().time()
         device = gone(home, 2)
@@ -219,12 +219,12 @@ async def test_events(over: Over, tmp_path: Path) -> None:
         await rig.stop()
         await rig.clear()
         await asyncio.sleep(0.1)
-        listening.cancel()
-        names = [event.name for event in heard]
+        reading.cancel()
+        names = [event.name for event in events]
         assert [name for name in names if name != "servo_note"] == ["servo_offline", "servo_online", "estop", "estop_cleared"]
-        assert heard[0].fields["servo"] == "s2"
-        assert begun < heard[0].time < begun + 5
-        assert not any(event.missed for event in heard)
+        assert events[0].fields["servo"] == "s2"
+        assert begun < events[0].time < begun + 5
+        assert not any(event.missed for event in events)
 
 
 @both

@@ -29,7 +29,7 @@ async def test_start_asks_and_writes_nothing() -> None:
 
 
 @virtual
-async def test_a_missing_servo_is_no_error_at_start_and_is_found_when_it_comes() -> None:
+async def test_a_servo_missing_at_start_is_identified_later() -> None:
     async with open_rig(config(poll="{feedback: 50}")) as rig:
         devices(rig)[2].dead = True
         with pytest.raises(ReplyTimeout, match="arm/s2"):
@@ -113,7 +113,7 @@ async def test_goals_of_one_moment_leave_in_one_frame() -> None:
 
 
 @virtual
-async def test_a_newer_goal_takes_the_place_of_an_older_one() -> None:
+async def test_a_newer_goal_replaces_an_older_one() -> None:
     async with open_rig(config()) as rig:
         await rig.enable()
         first, second = await asyncio.gather(rig["s1"].move_to(5), rig["s1"].move_to(7))
@@ -122,7 +122,7 @@ async def test_a_newer_goal_takes_the_place_of_an_older_one() -> None:
 
 
 @virtual
-async def test_a_goal_too_old_is_dropped_and_said_so() -> None:
+async def test_a_goal_that_is_too_old_is_dropped_with_an_error() -> None:
     async with open_rig(config()) as rig:
         await rig.enable()
         device = devices(rig)[1]
@@ -188,9 +188,9 @@ async def test_wheel_mode_spins_and_stops() -> None:
 async def test_the_end_leaves_each_servo_as_its_policy_says(policy: str, on: bool) -> None:
     async with open_rig(config(f"s1: {{id: 1, model: sts, on_exit: {policy}}}", "s2: {id: 2, model: sts}")) as rig:
         await rig.enable("s1")
-        known = devices(rig)
-    assert energised(known[1]) is on
-    assert not energised(known[2])
+        servos = devices(rig)
+    assert energised(servos[1]) is on
+    assert not energised(servos[2])
 
 
 @virtual
@@ -230,7 +230,7 @@ async def test_the_end_parks() -> None:
 
 
 @virtual
-async def test_an_error_in_the_body_comes_out_as_it_is_and_the_policy_is_applied() -> None:
+async def test_an_error_in_the_block_is_raised_after_the_exit_policy() -> None:
     with pytest.raises(ZeroDivisionError):  # noqa: PT012 - it is raised by the last statement
         async with open_rig(config("s1: {id: 1, model: sts, on_exit: limp}")) as rig:
             await rig.enable()

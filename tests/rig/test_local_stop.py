@@ -104,7 +104,7 @@ async def test_disable_is_for_one_servo_and_no_e_stop() -> None:
 
 
 @virtual
-async def test_a_restarted_servo_is_disabled_and_its_goal_is_not_said_again() -> None:
+async def test_a_restarted_servo_is_disabled_and_its_goal_not_repeated() -> None:
     async with open_rig(config(poll="{feedback: 50}")) as rig:
         await rig.enable()
         await rig["s1"].move_to(20)
@@ -157,7 +157,7 @@ async def test_a_port_that_is_missing_is_an_error_or_waited_for() -> None:
 
 
 @virtual
-async def test_read_answers_from_the_last_poll_when_that_is_fresh_enough() -> None:
+async def test_read_returns_the_last_poll_when_it_is_fresh_enough() -> None:
     async with open_rig(config(poll="{feedback: 50}")) as rig:
         await asyncio.sleep(0.1)
         before = frames(rig)
@@ -172,12 +172,12 @@ async def test_read_answers_from_the_last_poll_when_that_is_fresh_enough() -> No
 @virtual
 async def test_watch_gives_snapshots() -> None:
     async with open_rig(config(poll="{feedback: 50}")) as rig:
-        seen = []
+        snapshots = []
         async for snapshot in rig.watch(hz=20):
-            seen.append(snapshot)
-            if len(seen) == 3:
+            snapshots.append(snapshot)
+            if len(snapshots) == 3:
                 break
-        assert all(set(snapshot) == {"arm/s1", "arm/s2", "arm/s3"} for snapshot in seen)
+        assert all(set(snapshot) == {"arm/s1", "arm/s2", "arm/s3"} for snapshot in snapshots)
         with pytest.raises(ValueError, match="0"):
             await anext(aiter(rig.watch(hz=0)))
 
@@ -207,8 +207,8 @@ async def test_settle_says_where_it_stands() -> None:
 async def test_scan_finds_and_refuses_while_something_is_enabled() -> None:
     async with open_rig(config()) as rig:
         progress: list[int] = []
-        found = await rig.scan("arm", ids=range(4), progress=lambda asked, count, hit: progress.append(asked))
-        assert [(hit.id, hit.model) for hit in found] == [(1, "sts"), (2, "sts"), (3, "sts")]
+        hits = await rig.scan("arm", ids=range(4), progress=lambda asked, count, hit: progress.append(asked))
+        assert [(hit.id, hit.model) for hit in hits] == [(1, "sts"), (2, "sts"), (3, "sts")]
         assert progress[-1] == 4
         await rig.enable("s1")
         with pytest.raises(Busy, match="s1"):
@@ -222,13 +222,13 @@ async def test_scan_over_baud_rates_comes_back_to_the_own_one() -> None:
     async with open_rig(config()) as rig:
         device = devices(rig)[2]
         device.baudrate = 115200
-        found = await rig.scan("arm", baudrates=[115200, 1000000], ids=range(4))
-        assert [(hit.id, hit.baudrate) for hit in found] == [(2, 115200), (1, 1000000), (3, 1000000)]
+        hits = await rig.scan("arm", baudrates=[115200, 1000000], ids=range(4))
+        assert [(hit.id, hit.baudrate) for hit in hits] == [(2, 115200), (1, 1000000), (3, 1000000)]
         assert (await rig.read("s1")).position == 0
 
 
 @virtual
-async def test_a_goal_with_everything_said() -> None:
+async def test_a_goal_with_every_option() -> None:
     async with open_rig(
         config("s1: {id: 1, model: sts, max_speed: 180, max_step: 50, acceleration: 500, torque_limit: 80}")
     ) as rig:

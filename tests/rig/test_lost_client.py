@@ -40,7 +40,7 @@ async def test_each_does_what_its_config_says() -> None:
 
 
 @virtual
-async def test_waiting_goals_of_the_lost_are_dropped_and_those_of_others_go_on() -> None:
+async def test_only_the_goals_of_the_lost_client_are_dropped() -> None:
     async with open_rig(config(HOLD, OTHER)) as rig:
         await rig.enable()
         reading = asyncio.create_task(rig["s4"].read())

@@ -114,7 +114,7 @@ async def test_no_session_while_something_is_being_enabled() -> None:
 
 
 @virtual
-async def test_an_e_stop_of_a_line_that_is_down_is_said_when_it_is_back() -> None:
+async def test_an_e_stop_reaches_a_line_that_was_down_when_it_is_back() -> None:
     async with open_rig(config(LIMP)) as rig:
         await rig.enable()
         link = rig.supervisors["arm"].link
@@ -129,7 +129,7 @@ async def test_an_e_stop_of_a_line_that_is_down_is_said_when_it_is_back() -> Non
 
 
 @virtual
-async def test_who_waits_for_arrival_is_told_that_it_will_not_come() -> None:
+async def test_settle_ends_when_the_goal_cannot_be_reached_any_more() -> None:
     async with open_rig(config("s1: {id: 1, model: sts}")) as rig:
         await rig.enable()
         await rig["s1"].move_to(80)
@@ -168,7 +168,7 @@ async def test_one_servo_under_two_names() -> None:
 
 
 @virtual
-async def test_a_duration_does_not_pass_the_greatest_speed() -> None:
+async def test_a_duration_does_not_exceed_max_speed() -> None:
     async with open_rig(config("s1: {id: 1, model: sts, max_speed: 90}")) as rig:
         await rig.enable()
         await rig["s1"].move_to(80)

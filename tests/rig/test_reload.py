@@ -151,8 +151,8 @@ async def test_a_rig_without_a_file_says_so() -> None:
 async def test_it_is_an_event(path: Path) -> None:
     async with open_rig(path) as rig:
         events = rig.events()
-        told = asyncio.ensure_future(anext(events))
+        event = asyncio.ensure_future(anext(events))
         await asyncio.sleep(0)
         await rig.reload()
-        assert (await told).name == "reloaded"
+        assert (await event).name == "reloaded"
         await events.aclose()
