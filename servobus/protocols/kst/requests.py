@@ -66,6 +66,8 @@ class KstRequest(Request[R]):
         return reply.address == self.node and reply.code in (REPLY + self.command, REFUSED + self.command)
 
     def parse(self, replies: Sequence[Frame]) -> R:
+        if not replies:
+            return cast("R", None)
         reply = replies[0]
         if reply.refused:
             raise self.settings.aborts.error(reply.address, name_of(self.command), reply.data, request=self, raw=reply.frame)
@@ -160,6 +162,3 @@ class UnansweredCommand(KstRequest[None]):
         self.nodes = ()
         self.idempotent = command == Command.SET_POSITION
         self.quiet_after = max(settings.guard, settings.flash_time if command == Command.SAVE else 0.0)
-
-    def parse(self, replies: Sequence[Frame]) -> None:
-        """Return nothing."""

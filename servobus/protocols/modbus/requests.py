@@ -8,10 +8,9 @@ says otherwise.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from servobus.errors import DeviceError
 from servobus.protocols.base import Request
@@ -96,9 +95,9 @@ class ModbusRequest(Request[R]):
         meaning = EXCEPTIONS.get(code, "an exception of its own")
         return DeviceError(f"unit {self.node} refused: {meaning} ({code})", code=code, request=self, raw=reply.frame)
 
-    @abstractmethod
     def value(self, data: bytes) -> R:
-        """Return the value of a reply that is not an exception."""
+        """Return the value of a reply that is not an exception. The default is for writes, whose reply only repeats them."""
+        return cast("R", None)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.frame.hex(' ')})"
@@ -153,14 +152,7 @@ class Fence(PresenceRead[R]):
         return super().answers(reply) and (self.refusable or not reply.function & REFUSED)
 
 
-class Write(ModbusRequest[None]):
-    """What all writes share; `answers` has compared what the reply repeats."""
-
-    def value(self, data: bytes) -> None:
-        """Return nothing: the unit accepted the write."""
-
-
-class WriteSingle(Write):
+class WriteSingle(ModbusRequest[None]):
     """0x06: writes one register. Only for lines without an echo, because the correct reply equals the request."""
 
     mirrored = True
@@ -172,7 +164,7 @@ class WriteSingle(Write):
         self.idempotent = repeat
 
 
-class WriteMultiple(Write):
+class WriteMultiple(ModbusRequest[None]):
     """0x10: writes registers from `address` on. A unit may stop at the first one it refuses, so a refused write may be applied in
     part."""
 

@@ -99,7 +99,7 @@ def test_silence_after_what_is_not_answered() -> None:
     assert UnansweredCommand(settings, 1, Command.SAVE, b"save").quiet_after == 0.3
     assert UnansweredCommand(RequestSettings(guard=0.004, flash_time=0), 1, Command.SAVE, b"save").quiet_after == 0.004
     assert (Save(settings, 1).service_time, Save(settings, 1).quiet_after) == (0.3, 0.3)
-    assert UnansweredCommand(settings, 1, Command.SAVE, b"save").parse(()) is None  # type: ignore[func-returns-value]
+    assert UnansweredCommand(settings, 1, Command.SAVE, b"save").parse(()) is None
     with pytest.raises(DeviceError):
         Save(settings, 1).parse([frame_of(encode(1, 0xCF, b"\x08\x00\x00\x20"))])
 
