@@ -40,11 +40,15 @@ class FaultOptions(Data):
     late: Share = 0.0
     """Share of replies that come `delay_ms` too late."""
     delay_ms: Annotated[float, Field(ge=0, le=10_000)] = 0.0
+    """Delay of a late reply, in ms."""
     duplicate: Share = 0.0
     """Share of replies that are sent twice, back to back."""
     truncate: Share = 0.0
+    """Share of replies that end too early."""
     drop_byte: Share = 0.0
+    """Share of replies with one byte missing."""
     insert_byte: Share = 0.0
+    """Share of replies with one byte more."""
     flip: Share = 0.0
     """Share of replies with one byte changed."""
     wrong_id: Share = 0.0
@@ -54,48 +58,52 @@ class FaultOptions(Data):
     echo: Share = 0.0
     """Share of requests that come back as an echo."""
     seed: int = 0
+    """Seed of the random numbers: the same seed gives the same faults."""
 
 
 class ServoOptions(Data):
     """One servo of any bus."""
 
     id: int
+    """Id of the servo's node on the line."""
     model: str = ""
+    """Model of the servo: a name, or the path of a model file of your own."""
     zero: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
-    """Raw steps where the joint is at 0; the model's own if omitted."""
+    """Raw position of the servo where the joint is at 0, in steps; the model's middle if omitted."""
     direction: Literal[1, -1] = 1
-    """-1: the servo is mounted the other way round."""
+    """Sign of the joint's position: -1 where the servo is mounted the other way round."""
     gear: Annotated[float, Field(ge=0.001, le=1000)] = 1.0
     """Turns of the servo for one turn of the joint."""
     limits: Pair[Finite] | None = None
-    """Lowest and highest position that a goal may have."""
+    """Lowest and highest position that a goal may have, in the servo's unit."""
     on_limit: Literal["reject", "clamp"] = "reject"
     """What happens to a goal outside a limit: it is refused, or the nearest value inside is sent and an event reports that."""
     speed: Positive | None = None
-    """Unit/s of goals that name no speed; max_speed if omitted."""
+    """Speed of goals that name none, in unit/s; max_speed if omitted."""
     max_speed: Positive | None = None
-    """Unit/s that no goal may exceed."""
+    """Highest speed that a goal may have, in unit/s; the model's own if omitted."""
     max_step: Positive | None = None
-    """Longest distance from the last setpoint that one goal may ask for."""
+    """Longest distance of a goal from the last setpoint, in the servo's unit; no limit if omitted."""
     acceleration: Positive | None = None
-    """Unit/s^2 of goals that name no acceleration."""
+    """Acceleration of goals that name none, in unit/s^2; the servo's own setting if omitted."""
     torque_limit: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Percent of the servo's torque, for goals that name no effort."""
+    """Effort of goals that name none, in percent of the servo's torque; the servo's own setting if omitted."""
     ttl: Positive | None = None
-    """Seconds that a goal may wait for its first byte to leave; later it is dropped."""
+    """Time in s within which a goal's first byte must leave; the larger of 0.2 s and two turns if omitted."""
     on_estop: StopKind = "hold"
     """What an e-stop does: hold keeps the present position, limp switches torque off, park goes to park_pose and then limp."""
     on_exit: StopKind = "hold"
-    """The same, when servobus ends."""
+    """What servobus does to an enabled servo when it ends: hold, limp or park."""
     on_lost_client: StopKind = "hold"
-    """The same, when the program that moved the servo is gone."""
+    """What happens when the program that moved the servo is gone: hold, limp or park."""
     park_pose: Finite | None = None
+    """Position that park goes to, in the servo's unit."""
     park_timeout: Positive = 5.0
-    """Seconds to reach park_pose; then the servo goes limp, wherever it is."""
+    """Time in s to reach park_pose; then the servo goes limp, wherever it is."""
     unit: str | None = None
     """Unit of positions and speeds: one of the model's units, the first of them if omitted."""
     allow_max_speed: bool = False
-    """Permit speed 0 in a goal, which means no limit to servos."""
+    """Whether a goal may have the speed 0, which servos take as no limit."""
 
     @property
     def key(self) -> Hashable:
@@ -126,9 +134,9 @@ class PollRates(Data):
     """Reads on a fixed grid, in Hz; omit for none."""
 
     feedback: Rate | None = None
-    """Rate of the values that control needs: position, speed, load and the registers beside them."""
+    """Rate in Hz of the values that control needs: position, speed, load and the registers beside them."""
     health: Rate | None = None
-    """Rate of the whole state."""
+    """Rate in Hz of the whole state."""
 
     def rates(self) -> dict[str, float]:
         return {name: hz for name, hz in (("feedback", self.feedback), ("health", self.health)) if hz}
@@ -138,23 +146,26 @@ class BusOptions(Data):
     """One bus of any protocol. `protocol` and `servos` are narrowed by each."""
 
     protocol: str
+    """Protocol of the servos on the line."""
     port: Annotated[str, Field(min_length=1, max_length=255)]
-    """Device path, tcp://HOST:PORT, or sim: for simulated servos. A /dev/serial/by-id name is best, because it belongs to the
-    adapter."""
+    """Device file, tcp://HOST:PORT, realman://HOST:PORT?port=N, or sim: for simulated servos. A /dev/serial/by-id name is best,
+    because it belongs to the adapter."""
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)]
-    """Bits/s that the servos are set to."""
+    """Baud rate of the servos, in bits/s."""
     poll: PollRates = PollRates()
+    """Rates at which the servos are read."""
     goal_rate: Rate | None = None
-    """Hz at which goals are expected; `check` computes the line's load with it. The feedback rate if omitted."""
+    """Rate in Hz at which goals are expected: `check` computes the line's load with it. The feedback rate if omitted."""
     echo: Literal["off", "on", "auto"] = "off"
     """Whether the adapter receives what it sends; auto finds out with a request to an id that nobody has."""
     rs485: bool = False
     """Let the driver of the port switch the transmitter; USB adapters switch it by themselves."""
     timeout_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
-    """Longest wait for a reply beyond its wire time; 100 ms if omitted."""
+    """Longest wait in ms for a reply beyond its wire time; 100 if omitted."""
     faults: FaultOptions | None = None
     """Faults of a simulated line."""
     servos: Mapping[Name, ServoOptions] = {}
+    """The servos by name; without any, the line can be scanned."""
 
     @model_validator(mode="after")
     def _faults_only_simulated(self) -> Self:

@@ -46,8 +46,8 @@ def test_the_schema_refuses_what_an_editor_can_see(name: str) -> None:
 
 def test_the_schema_explains_the_keys() -> None:
     definitions = config_schema()["$defs"]
-    assert definitions["SmsServo"]["properties"]["zero"]["description"].startswith("Raw steps where the joint is at 0")
-    assert definitions["SmsBus"]["properties"]["sync_max_bytes"]["description"].startswith("Greatest SYNC WRITE frame")
+    assert definitions["SmsServo"]["properties"]["zero"]["description"].startswith("Raw position of the servo where")
+    assert definitions["SmsBus"]["properties"]["sync_max_bytes"]["description"].startswith("Longest SYNC WRITE frame")
 
 
 def test_the_schema_has_every_key() -> None:

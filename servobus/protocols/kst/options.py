@@ -48,6 +48,7 @@ class KstServo(ServoOptions):
 class KstBus(BusOptions):
     protocol: Literal["kst"]
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)] = 512_000
+    """Baud rate of the servos, in bits/s."""
     duplex: Literal["half", "full"] = "half"
     """full: RS422 has four wires, so the next request may travel while the previous reply arrives."""
     reply_delay_ms: Pair[Annotated[float, Field(ge=0, le=100)]] = (0.0, 0.5)
@@ -74,9 +75,9 @@ class KstBus(BusOptions):
     id_range: Pair[Annotated[int, Field(ge=1, le=255)]] = (1, 254)
     """Minimum and maximum id that may be used and assigned."""
     baud_table: Annotated[dict[Byte, Annotated[int, Field(ge=300)]], Field(min_length=1)] = BAUD_TABLE
-    """Code of the baud rate command -> rate."""
+    """Rates of the baud rate command, in bits/s, by code."""
     servos: dict[Name, KstServo] = {}
-    """Empty: a line to scan."""
+    """The servos by name; without any, the line can be scanned."""
 
     @property
     def spread(self) -> float | None:

@@ -30,6 +30,7 @@ class RohServo(ServoOptions):
     id: Unit
     """The hand's unit, 1 to 247; a new hand has 2."""
     channel: Channel
+    """The finger, or the rotation of the thumb."""
     model: Literal["finger"] = "finger"
     """Always `finger`; the hand's register map is a key of `units`."""
     unit: Literal["%", "deg"] | None = None
@@ -64,6 +65,7 @@ class UnitOptions(Data):
 class RohBus(BusOptions):
     protocol: Literal["roh"]
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)] = 115_200
+    """Baud rate of the hands, in bits/s."""
     units: dict[Unit, UnitOptions] = {}
     """Hands whose map is pinned; all others are `auto`."""
     max_read: Annotated[int, Field(ge=1, le=MAX_READ)] | None = None
@@ -75,7 +77,7 @@ class RohBus(BusOptions):
     turnaround_ms: Annotated[float, Field(ge=0, le=10_000)] = 100.0
     """Silence after a broadcast, in ms."""
     servos: dict[Name, RohServo] = {}
-    """Empty: a line to scan."""
+    """The servos by name; without any, the line can be scanned."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

@@ -19,13 +19,13 @@ class SmsServo(ServoOptions):
 class SmsBus(BusOptions):
     protocol: Literal["sms"]
     sync_max_bytes: Annotated[int, Field(ge=16, le=259)] = 128
-    """Greatest SYNC WRITE frame; the length byte allows 259 bytes, the servos' buffers are not documented."""
+    """Longest SYNC WRITE frame, in bytes: the length byte allows 259, and the servos' buffers are not documented."""
     status_return: Literal["all", "read_only"] = "all"
     """Which instructions the servos answer (response level of the memory table): all, or only PING and READ."""
     on_partial: Literal["abort", "go"] = "abort"
     """When a servo does not acknowledge its REG WRITE: withhold ACTION, or send it for the servos that are armed."""
     servos: dict[Name, SmsServo] = {}
-    """Empty: a line to scan."""
+    """The servos by name; without any, the line can be scanned."""
 
     @property
     def writes_answered(self) -> bool:
