@@ -9,48 +9,38 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
-import servobus
 from servobus.cli.output import accept_any_encoding, echo
 from servobus.errors import ServobusError
 
-
-class CommandInfo(NamedTuple):
-    """One line of the table of commands."""
-
-    module: str
-    """The module beside this one that has the command."""
-    help: str
-    """The first sentence of the command's docstring; a test keeps the two equal."""
-
-
 COMMANDS = {
-    "run": CommandInfo("service", "Own the ports of CONFIG as a daemon, and serve other programs."),
-    "sim": CommandInfo("service", "Serve the servos of CONFIG, simulated, as serial ports."),
-    "demo": CommandInfo("service", "Stream goals to 20 simulated servos on four lines."),
-    "check": CommandInfo("offline", "Validate a config and print the load of each line."),
-    "schema": CommandInfo("offline", "Print the JSON Schema of configs, for editors."),
-    "decode": CommandInfo("offline", "Explain the frames in some bytes."),
-    "ports": CommandInfo("offline", "List the serial ports of this machine."),
-    "scan": CommandInfo("scan", "Search a line for servos."),
-    "ping": CommandInfo("registers", "Ask servos whether they answer."),
-    "read": CommandInfo("registers", "Read the state of servos, or one register of a servo."),
-    "write": CommandInfo("registers", "Write registers of a servo, and read them back."),
-    "monitor": CommandInfo("monitor", "Show the state of servos, live."),
-    "stats": CommandInfo("monitor", "Print the counters and times of each line."),
-    "move": CommandInfo("move", "Move servos and wait until they arrive."),
-    "enable": CommandInfo("move", "Switch torque on; each servo holds its present position."),
-    "disable": CommandInfo("move", "Switch torque off, and confirm it by reading back."),
-    "stop": CommandInfo("move", "E-stop all servos of all buses."),
-    "clear": CommandInfo("move", "Release the e-stop of a daemon."),
-    "set-id": CommandInfo("maintenance", "Change the id of a servo."),
-    "set-baud": CommandInfo("maintenance", "Change the baud rate of a servo."),
-    "command": CommandInfo("maintenance", "Send a maintenance command to a servo or a hand."),
-    "install-service": CommandInfo("install", "Print or write the files of a system service."),
+    "run": ("service", "Own the ports of CONFIG as a daemon, and serve other programs."),
+    "sim": ("service", "Serve the servos of CONFIG, simulated, as serial ports."),
+    "demo": ("service", "Stream goals to 20 simulated servos on four lines."),
+    "check": ("offline", "Validate a config and print the load of each line."),
+    "schema": ("offline", "Print the JSON Schema of configs, for editors."),
+    "decode": ("offline", "Explain the frames in some bytes."),
+    "ports": ("offline", "List the serial ports of this machine."),
+    "scan": ("scan", "Search a line for servos."),
+    "ping": ("registers", "Ask servos whether they answer."),
+    "read": ("registers", "Read the state of servos, or one register of a servo."),
+    "write": ("registers", "Write registers of a servo, and read them back."),
+    "monitor": ("monitor", "Show the state of servos, live."),
+    "stats": ("monitor", "Print the counters and times of each line."),
+    "move": ("move", "Move servos and wait until they arrive."),
+    "enable": ("move", "Switch torque on; each servo holds its present position."),
+    "disable": ("move", "Switch torque off, and confirm it by reading back."),
+    "stop": ("move", "E-stop all servos of all buses."),
+    "clear": ("move", "Release the e-stop of a daemon."),
+    "set-id": ("maintenance", "Change the id of a servo."),
+    "set-baud": ("maintenance", "Change the baud rate of a servo."),
+    "command": ("maintenance", "Send a maintenance command to a servo or a hand."),
+    "install-service": ("install", "Print or write the files of a system service."),
 }
+"""Command -> the module beside this one that has it, and the first sentence of its docstring (a test keeps the two equal)."""
 INTERRUPTED = 130
 
 
@@ -63,7 +53,7 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"servobus.cli.{COMMANDS[cmd_name].module}")
+        module = importlib.import_module(f"servobus.cli.{COMMANDS[cmd_name][0]}")
         command: click.Command = getattr(module, cmd_name.replace("-", "_"))
         return command
 
@@ -77,17 +67,11 @@ class Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, info.help) for name, info in COMMANDS.items()])
-
-
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted and not ctx.resilient_parsing:
-        echo(servobus.__version__)
-        ctx.exit()
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the version.")
+@click.version_option(package_name="servobus", message="%(version)s")
 def cli() -> None:
     """servobus owns a robot's serial lines and gives many callers safe access to many servos.
 

@@ -1,16 +1,14 @@
-"""What a command checks in a config before a port is opened: goals, registers, buses, and the load of each line."""
+"""What a command checks in a config before a port is opened: goals, registers, and the load of each line."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
-
-import click
 
 from servobus.bus.bandwidth import Bandwidth, line_bandwidth
 from servobus.bus.limits import check_goal
 from servobus.config.loader import Config
-from servobus.errors import NotSupported, ServobusError, UnknownName
+from servobus.errors import ServobusError
 from servobus.links import open_link
 from servobus.protocols.base import Driver, LineTraits
 from servobus.protocols.options import BusOptions
@@ -21,24 +19,14 @@ from servobus.values import Goal, ServoGoal
 
 
 def check_goals(config: Config, positions: Mapping[str, float], speed: float | None, duration: float | None) -> None:
-    """Raises LimitError, UnknownName or NotSupported for a goal that its servo may not take."""
-    for name, position in by_full_name(positions, lambda name: full_name(config.names, name)).items():
+    """Raises LimitError or NotSupported for a position (by full name) that its servo may not take."""
+    for name, position in positions.items():
         bus, servo = config.names[name]
         try:
             goal = check_goal(servo, Goal("position", position, speed, duration), config.buses[bus].servos[servo], None)
             _driver(config, bus).check_goal(ServoGoal(servo, goal))
         except ServobusError as error:
             raise error.at(bus=bus) from None
-
-
-def by_full_name(positions: Mapping[str, float], full: Callable[[str], str]) -> dict[str, float]:
-    """The same positions by full name. Raises BadParameter where two names mean one servo."""
-    goals: dict[str, float] = {}
-    for name, position in positions.items():
-        if full(name) in goals:
-            raise click.BadParameter(f"{full(name)} is named twice: give each servo one position", param_hint="NAME=POSITION")
-        goals[full(name)] = position
-    return goals
 
 
 def check_registers(config: Config, name: str, values: Mapping[str, Any], *, raw: bool, persist: bool) -> None:
@@ -50,18 +38,6 @@ def check_registers(config: Config, name: str, values: Mapping[str, Any], *, raw
             driver.write_register(servo, register, value, raw=raw, persist=persist).close()
         except ServobusError as error:
             raise error.at(bus=bus, servo=servo) from None
-
-
-def check_bus(config: Config, bus: str) -> None:
-    """Raises UnknownName for a bus that the config does not have."""
-    if bus not in config.buses:
-        raise UnknownName(f"no bus {bus!r}: there are {', '.join(config.buses)}")
-
-
-def refuse_clear(config: Config) -> None:
-    """Raises NotSupported: without a daemon no e-stop is latched."""
-    buses = ", ".join(config.buses)
-    raise NotSupported(f"no e-stop is latched on {buses}: no daemon runs (`servobus run`), and only a daemon latches one")
 
 
 def line_loads(config: Config) -> dict[str, Bandwidth]:

@@ -6,7 +6,7 @@ import asyncio
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from servobus.cli.checks import line_loads
@@ -53,14 +53,6 @@ def config_text() -> str:
     return text
 
 
-@dataclass(slots=True)
-class GoalResults:
-    """How the goals of one bus ended."""
-
-    outcomes: Counter[str] = field(default_factory=Counter)
-    errors: Counter[str] = field(default_factory=Counter)
-
-
 async def stream(seconds: float, *, as_json: bool) -> int:
     """Stream goals for some seconds and print the result. Returns the exit status."""
     config = parse_config(config_text(), "demo")
@@ -69,11 +61,11 @@ async def stream(seconds: float, *, as_json: bool) -> int:
     async with open_rig(config) as rig:
         await rig.enable()
         before = rig.stats()
-        results = {name: GoalResults() for name in config.buses}
+        results: dict[str, Counter[str]] = {name: Counter() for name in config.buses}
         start = asyncio.get_running_loop().time()
         await asyncio.gather(*(_caller(servo, results[rig.names[servo.name][0]], start, seconds) for servo in rig))
         elapsed = asyncio.get_running_loop().time() - start
-        rows = {name: _row(rig, name, result, before[name], elapsed) for name, result in results.items()}
+        rows = {name: _row(rig, name, counts, before[name], elapsed) for name, counts in results.items()}
     if as_json:
         emit(rows)
     else:
@@ -84,44 +76,41 @@ async def stream(seconds: float, *, as_json: bool) -> int:
 def _print_loads(config: Config) -> None:
     for name, load in line_loads(config).items():
         options = config.buses[name]
-        verdict = (
-            "carries that"
-            if load.total <= 100
-            else "cannot carry all of that: newer goals replace older ones, and polls are skipped"
-        )
+        verdict = "carries that"
+        if load.total > 100:
+            verdict = "cannot carry all of that: newer goals replace older ones, and polls are skipped"
         echo(
             f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each "
             f"and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line; it {verdict}"
         )
 
 
-async def _caller(servo: Servo, result: GoalResults, start: float, seconds: float) -> None:
+async def _caller(servo: Servo, results: Counter[str], start: float, seconds: float) -> None:
     """Sends goals on a fixed grid. A goal that has not left when the next one is due is replaced, as in any streaming caller."""
     loop, bus = asyncio.get_running_loop(), BUSES[servo.name.partition("/")[0]]
     pending: set[asyncio.Task[None]] = set()
     for tick in range(int(seconds * GOAL_HZ)):
         await asyncio.sleep(start + tick / GOAL_HZ - loop.time())
         position = bus.middle + bus.swing * math.sin(2 * math.pi * tick / GOAL_HZ / PERIOD_S)
-        task = loop.create_task(_send(servo, position, result))
+        task = loop.create_task(_send(servo, position, results))
         pending.add(task)
         task.add_done_callback(pending.discard)
     await asyncio.gather(*pending)
     await asyncio.sleep(start + seconds - loop.time())
 
 
-async def _send(servo: Servo, position: float, result: GoalResults) -> None:
+async def _send(servo: Servo, position: float, results: Counter[str]) -> None:
+    """Counts how the goal ends: its outcome, or the class of its error."""
     try:
-        outcome = await servo.move_to(position)
+        results[await servo.move_to(position)] += 1
     except ServobusError as error:
-        result.errors[type(error).__name__] += 1
-    else:
-        result.outcomes[outcome] += 1
+        results[type(error).__name__] += 1
 
 
-def _row(rig: LocalRig, name: str, result: GoalResults, before: dict[str, Any], seconds: float) -> dict[str, Any]:
+def _row(rig: LocalRig, name: str, results: Counter[str], before: dict[str, Any], seconds: float) -> dict[str, Any]:
     stats = rig.stats()[name]
-    goals = sum(result.outcomes.values())
-    delivered = goals - result.outcomes[Outcome.SUPERSEDED]
+    goals = sum(results[outcome] for outcome in Outcome)
+    delivered = goals - results[Outcome.SUPERSEDED]
     frames = stats["goal_turns"] - before["goal_turns"]  # each goal turn of the demo is one frame
     feedback = stats.get("polled", 0) - before.get("polled", 0)
     servos = len(rig.config.buses[name].servos)
@@ -134,5 +123,5 @@ def _row(rig: LocalRig, name: str, result: GoalResults, before: dict[str, Any], 
         "wire load %": stats["wire_load_percent"],
         "turn p50 ms": stats["turn_ms"]["p50"],
         "turn p99 ms": stats["turn_ms"]["p99"],
-        "errors": sum(result.errors.values()),
+        "errors": results.total() - goals,
     }

@@ -1,4 +1,4 @@
-"""Where a process of the command line logs: the `servobus` tree of `logging`, formatted by structlog, on standard error."""
+"""The logs of a command: the `servobus` tree of `logging`, formatted by structlog, on standard error."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import logging
 import os
 import sys
 from collections.abc import MutableMapping
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, TextIO, cast
-
-from servobus.cli.safe_stream import SafeStream
 
 
 def set_up_logs(level: int = logging.WARNING) -> None:
@@ -50,3 +49,33 @@ def _event_and_fields(_: Any, __: str, event: MutableMapping[str, Any]) -> Mutab
     record = event["_record"]
     fields = getattr(record, "servobus_fields", {})
     return {**fields, **event, "event": getattr(record, "servobus_event", event["event"])}
+
+
+class SafeStream:
+    """Discards everything once nobody reads the stream: a closed terminal or pipe must not stop a bus in mid-turn."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write_line(self, line: str) -> None:
+        self.write(f"{line}\n")
+        self.flush()
+
+    def write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+        except OSError:
+            self._discard()
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except OSError:
+            self._discard()
+
+    def _discard(self) -> None:
+        """Sends everything further to /dev/null, also what the interpreter flushes when it ends."""
+        with suppress(OSError):
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)

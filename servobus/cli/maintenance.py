@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import click
 
 import servobus
 from servobus.cli.options import Options, RigContext, on_rig, servo_options
 from servobus.cli.output import echo, emit
+from servobus.errors import UnknownName
 from servobus.values import Change
 
 ID = click.IntRange(0, 255)
@@ -21,7 +23,7 @@ SAVE = "Save the change in the servo's flash; otherwise a restart of the servo f
 @click.argument("new", type=ID)
 @click.option("--save", is_flag=True, help=SAVE)
 @servo_options
-def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
+def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> None:
     """Change the id of a servo. The servo with id OLD on BUS, a bus of the config, gets the id NEW.
 
     Refused while a servo of the bus is enabled, when two servos seem to answer at OLD, or when one answers at NEW. Moves nothing.
@@ -29,7 +31,7 @@ def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
 
     Example: servobus set-id gimbal 37 38 --save
     """
-    return _change(options, bus, lambda rig: rig.set_id(bus, old, new, save=save))
+    _change(options, bus, lambda rig: rig.set_id(bus, old, new, save=save))
 
 
 @click.command("set-baud")
@@ -38,14 +40,14 @@ def set_id(options: Options, bus: str, old: int, new: int, save: bool) -> int:
 @click.argument("baudrate", type=click.IntRange(min=1))
 @click.option("--save", is_flag=True, help=SAVE)
 @servo_options
-def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: bool) -> int:
+def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: bool) -> None:
     """Change the baud rate of a servo. The servo with this ID on BUS, a bus of the config, gets BAUDRATE, in bits/s.
 
     Refused while a servo of the bus is enabled. When all servos of the bus have the new rate, write it into the config.
 
     Example: servobus set-baud gimbal 37 115200 --save
     """
-    return _change(options, bus, lambda rig: rig.set_baudrate(bus, servo_id, baudrate, save=save))
+    _change(options, bus, lambda rig: rig.set_baudrate(bus, servo_id, baudrate, save=save))
 
 
 @click.command()
@@ -54,7 +56,7 @@ def set_baud(options: Options, bus: str, servo_id: int, baudrate: int, save: boo
 @click.argument("name")
 @click.argument("value", required=False, type=int)
 @servo_options
-def command(options: Options, bus: str, servo_id: int, name: str, value: int | None) -> int:
+def command(options: Options, bus: str, servo_id: int, name: str, value: int | None) -> None:
     """Send a maintenance command to a servo or a hand. The device with this ID on BUS, a bus of the config, gets it once.
 
     The protocol defines the commands (restart, save, zero_force, ...); an unknown NAME lists them. A command is never repeated,
@@ -62,21 +64,22 @@ def command(options: Options, bus: str, servo_id: int, name: str, value: int | N
 
     Example: servobus command hand 2 zero_force
     """
-    return _change(options, bus, lambda rig: rig.command(bus, servo_id, name, value))
+    _change(options, bus, lambda rig: rig.command(bus, servo_id, name, value))
 
 
-def _change(options: Options, bus: str, verb: Callable[[servobus.Rig], Awaitable[Change | tuple[str, ...]]]) -> int:
-    from servobus.cli.checks import check_bus
+def _change(options: Options, bus: str, verb: Callable[[servobus.Rig], Awaitable[Change | tuple[str, ...]]]) -> None:
+    def check(config: Any) -> None:
+        if bus not in config.buses:
+            raise UnknownName(f"no bus {bus!r}: there are {', '.join(config.buses)}")
 
-    async def action(context: RigContext) -> int:
+    async def action(context: RigContext) -> None:
         result = await verb(context.rig)
         if options.as_json:
             emit(result)
         else:
             echo("\n".join(_lines(result)))
-        return 0
 
-    return on_rig(options, action, only=[bus], before=lambda config: check_bus(config, bus))
+    on_rig(options, action, only=[bus], before=check)
 
 
 def _lines(result: Change | tuple[str, ...]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ MAX_HZ = 50.0
 @click.option("--count", type=click.IntRange(min=1), help="Stop after this number of updates.")
 @click.option("--seconds", type=Number(0.1), metavar="SECONDS", help="Stop after this time.")
 @servo_options
-def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None, seconds: float | None) -> int:
+def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | None, seconds: float | None) -> None:
     """Show the state of servos, live. Ends with Ctrl-C. Without a NAME all servos are shown.
 
     Positions are in the servo's unit, speed in unit/s, load in percent. A servo that the config does not poll is read at --hz. On
@@ -31,16 +31,15 @@ def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | No
     Example: servobus monitor --hz 5
     """
 
-    async def action(context: RigContext) -> int:
+    async def action(context: RigContext) -> None:
         if options.as_json:
             await _show(context, names, hz, _updates(hz, count, seconds), emit)
         elif not sys.stdout.isatty():
             await _show(context, names, hz, _updates(hz, count, seconds), _print_lines)
         else:
             await _show_live(context, names, hz, _updates(hz, count, seconds))
-        return 0
 
-    return on_rig(options, action, names)
+    on_rig(options, action, names)
 
 
 def _updates(hz: float, count: int | None, seconds: float | None) -> int | None:
@@ -92,7 +91,7 @@ async def _show(
     "--seconds", default=2.0, show_default=True, type=Number(0.1, 3600), help="Time to poll and count without a daemon."
 )
 @servo_options
-def stats(options: Options, seconds: float) -> int:
+def stats(options: Options, seconds: float) -> None:
     """Print the counters and times of each line. A daemon counts since its start; without one the command polls for a while.
 
     Turn times and deadlines are in ms, loads in percent of the line's time.
@@ -100,7 +99,7 @@ def stats(options: Options, seconds: float) -> int:
     Example: servobus stats --seconds 10
     """
 
-    async def action(context: RigContext) -> int:
+    async def action(context: RigContext) -> None:
         from asyncio import sleep
 
         if not context.has_daemon:
@@ -111,9 +110,8 @@ def stats(options: Options, seconds: float) -> int:
         else:
             for bus, counts in result.items():
                 _print_stats(bus, counts)
-        return 0
 
-    return on_rig(options, action)
+    on_rig(options, action)
 
 
 def _print_stats(bus: str, counts: Mapping[str, Any]) -> None:

@@ -5,14 +5,16 @@ A command without a daemon opens the ports, and when it ends it leaves each serv
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import click
 
-from servobus.cli.options import Number, Options, RigContext, on_rig, servo_options
+from servobus.cli.options import Number, Options, RigContext, on_rig, parse_pairs, servo_options
 from servobus.cli.output import echo, emit, report
-from servobus.errors import LimitError
+from servobus.errors import LimitError, NotSupported
 
+TARGET = "NAME=POSITION"
 NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
 THEN = {
     "stays": "stays enabled",
@@ -24,7 +26,7 @@ THEN = {
 
 
 @click.command()
-@click.argument("targets", metavar="NAME=POSITION...", nargs=-1, required=True)
+@click.argument("targets", metavar=f"{TARGET}...", nargs=-1, required=True)
 @click.option("--speed", type=float, metavar="UNIT/S", help="Speed on the way. Default: the servo's `speed` of the config.")
 @click.option("--duration", type=float, metavar="SECONDS", help="Time for the way, instead of a speed.")
 @click.option("--together", is_flag=True, help="All servos of a bus begin at the same moment, or none does.")
@@ -39,7 +41,7 @@ def move(
     together: bool,
     confirm: bool,
     timeout: float,
-) -> int:
+) -> None:
     """Move servos and wait until they arrive.
 
     Positions are in each servo's unit (degrees if the config names none). A goal outside a limit is refused before a port is
@@ -48,13 +50,17 @@ def move(
 
     Example: servobus move shoulder=10 elbow=-20 --speed 30
     """
-    from servobus.cli.checks import by_full_name, check_goals
+    positions = {name: _position(name, text) for name, text in parse_pairs(targets, TARGET, "elbow=30").items()}
 
-    positions = _positions(targets)
+    def check(config: Any) -> None:
+        from servobus.cli.checks import check_goals
+        from servobus.rig.interface import full_name
 
-    async def action(context: RigContext) -> int:
+        check_goals(config, _by_full_name(positions, lambda name: full_name(config.names, name)), speed, duration)
+
+    async def action(context: RigContext) -> None:
         rig = context.rig
-        goals = by_full_name(positions, rig.full_name)
+        goals = _by_full_name(positions, rig.full_name)
         if not context.has_daemon:
             await rig.enable(*goals)
         await rig.move(goals, together=together, confirm=confirm, speed=speed, duration=duration)
@@ -62,36 +68,32 @@ def move(
         data = {name: {"position": state.position, "then": context.then(name)} for name, state in states.items()}
         rows = [(name, state.position, THEN[context.then(name)]) for name, state in states.items()]
         report(options.as_json, data, ("servo", "position", "then"), rows)
-        return 0
 
-    return on_rig(options, action, list(positions), before=lambda config: check_goals(config, positions, speed, duration))
-
-
-def _positions(texts: Iterable[str]) -> dict[str, float]:
-    """Name -> position, with the names as they were given."""
-    positions: dict[str, float] = {}
-    for text in texts:
-        name, position = _position(text)
-        if name in positions:
-            raise click.BadParameter(f"{name} is named twice: give each servo one position", param_hint="NAME=POSITION")
-        positions[name] = position
-    return positions
+    on_rig(options, action, list(positions), before=check)
 
 
-def _position(text: str) -> tuple[str, float]:
-    name, equals, position = text.rpartition("=")
-    if not (name and equals):
-        raise click.BadParameter(f"{text!r}: write NAME=POSITION, for example elbow=30", param_hint="NAME=POSITION")
+def _position(target: str, text: str) -> float:
     try:
-        return name, float(position)
+        return float(text)
     except ValueError:
-        raise LimitError(f"{text}: {position!r} is not a number: nothing was sent") from None
+        raise LimitError(f"{target}={text}: {text!r} is not a number: nothing was sent") from None
+
+
+def _by_full_name(positions: Mapping[str, float], full_name: Callable[[str], str]) -> dict[str, float]:
+    """The same positions by full name. Raises BadParameter where two names mean one servo."""
+    goals: dict[str, float] = {}
+    for name, position in positions.items():
+        full = full_name(name)
+        if full in goals:
+            raise click.BadParameter(f"{full} is named twice: give each servo one position", param_hint=TARGET)
+        goals[full] = position
+    return goals
 
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @servo_options
-def enable(options: Options, names: tuple[str, ...]) -> int:
+def enable(options: Options, names: tuple[str, ...]) -> None:
     """Switch torque on; each servo holds its present position. Without a NAME all servos are enabled.
 
     A daemon keeps them enabled. Without a daemon they are left as their `on_exit` says at once: with `hold` they stay energised.
@@ -99,34 +101,32 @@ def enable(options: Options, names: tuple[str, ...]) -> int:
     Example: servobus enable elbow
     """
 
-    async def action(context: RigContext) -> int:
+    async def action(context: RigContext) -> None:
         await context.rig.enable(*names)
         enabled = context.rig.full_names(names)
         data = {name: {"enabled": True, "then": context.then(name)} for name in enabled}
         rows = [(name, "enabled", THEN[context.then(name)]) for name in enabled]
         report(options.as_json, data, ("servo", "state", "then"), rows)
-        return 0
 
-    return on_rig(options, action, names)
+    on_rig(options, action, names)
 
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @servo_options
-def disable(options: Options, names: tuple[str, ...]) -> int:
+def disable(options: Options, names: tuple[str, ...]) -> None:
     """Switch torque off, and confirm it by reading back. Without a NAME all servos are disabled.
 
     Example: servobus disable elbow
     """
 
-    async def action(context: RigContext) -> int:
+    async def action(context: RigContext) -> None:
         await context.rig.disable(*names)
         disabled = context.rig.full_names(names)
         data = {name: {"enabled": False} for name in disabled}
         report(options.as_json, data, ("servo", "state"), [(name, "limp") for name in disabled])
-        return 0
 
-    return on_rig(options, action, names)
+    on_rig(options, action, names)
 
 
 @click.command()
@@ -153,20 +153,22 @@ def stop(options: Options) -> int:
 
 @click.command()
 @servo_options
-def clear(options: Options) -> int:
+def clear(options: Options) -> None:
     """Release the e-stop of a daemon. Moves nothing.
 
     Example: servobus clear
     """
-    from servobus.cli.checks import refuse_clear
 
-    async def action(context: RigContext) -> int:
+    def refuse(config: Any) -> None:
+        buses = ", ".join(config.buses)
+        raise NotSupported(f"no e-stop is latched on {buses}: no daemon runs (`servobus run`), and only a daemon latches one")
+
+    async def action(context: RigContext) -> None:
         latched = context.rig.stopped
         await context.rig.clear()
         if options.as_json:
             emit({"released": latched})
         else:
             echo("the e-stop is released: enable and move again" if latched else "no e-stop was latched")
-        return 0
 
-    return on_rig(options, action, before=refuse_clear)
+    on_rig(options, action, before=refuse)

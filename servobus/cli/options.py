@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -68,6 +68,19 @@ class RigContext:
     def then(self, name: str) -> str:
         """What happens to an enabled servo when the command ends: stays, hold, limp or park."""
         return "stays" if self.on_exit is None else self.on_exit[name]
+
+
+def parse_pairs(texts: Iterable[str], hint: str, example: str) -> dict[str, str]:
+    """Split each NAME=VALUE. Raises BadParameter for another form and for a name that is given twice."""
+    pairs: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise click.BadParameter(f"{text!r}: write {hint}, for example {example}", param_hint=hint)
+        if name in pairs:
+            raise click.BadParameter(f"{name} is named twice: give each name one value", param_hint=hint)
+        pairs[name] = value
+    return pairs
 
 
 def servo_options(command: F) -> F:

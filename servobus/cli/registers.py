@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import click
 
 import servobus
-from servobus.cli.options import Options, RigContext, on_rig, servo_options
+from servobus.cli.options import Options, RigContext, on_rig, parse_pairs, servo_options
 from servobus.cli.output import STATE_COLUMNS, echo, echo_table, emit, report, show, state_row
 from servobus.errors import ServobusError
+
+VALUE = "REGISTER=VALUE"
 
 
 @click.command()
@@ -97,11 +99,11 @@ async def _read_states(rig: servobus.Rig, options: Options, names: tuple[str, ..
 
 @click.command()
 @click.argument("name")
-@click.argument("assignments", metavar="REGISTER=VALUE...", nargs=-1, required=True)
+@click.argument("assignments", metavar=f"{VALUE}...", nargs=-1, required=True)
 @click.option("--raw", is_flag=True, help="VALUE is the integer in the register instead of the physical value.")
 @click.option("--persist", is_flag=True, help="Allow EEPROM registers: each is unlocked, written, read back and locked again.")
 @servo_options
-def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, persist: bool) -> int:
+def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, persist: bool) -> None:
     """Write registers of a servo, and read them back.
 
     VALUE is in the register's own unit, or a name that the register knows. Without a daemon all values are checked before the
@@ -110,11 +112,14 @@ def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, 
 
     Example: servobus write elbow torque_limit=60
     """
-    from servobus.cli.checks import check_registers
+    values = {register: number_or_name(text) for register, text in parse_pairs(assignments, VALUE, "torque_limit=60").items()}
 
-    values = _values(assignments)
+    def check(config: Any) -> None:
+        from servobus.cli.checks import check_registers
 
-    async def action(context: RigContext) -> int:
+        check_registers(config, name, values, raw=raw, persist=persist)
+
+    async def action(context: RigContext) -> None:
         full = context.rig.full_name(name)
         written = {
             register: await context.rig.write_register(full, register, value, raw=raw, persist=persist)
@@ -125,26 +130,8 @@ def write(options: Options, name: str, assignments: tuple[str, ...], raw: bool, 
         else:
             for register, value in written.items():
                 echo(f"{full} {register} = {show(value)}")
-        return 0
 
-    return on_rig(options, action, [name], before=lambda config: check_registers(config, name, values, raw=raw, persist=persist))
-
-
-def _values(assignments: Iterable[str]) -> dict[str, Any]:
-    """Register -> value."""
-    values: dict[str, Any] = {}
-    for register, value in map(_assignment, assignments):
-        if register in values:
-            raise click.BadParameter(f"{register} is named twice: give each register one value", param_hint="REGISTER=VALUE")
-        values[register] = value
-    return values
-
-
-def _assignment(text: str) -> tuple[str, Any]:
-    register, equals, value = text.partition("=")
-    if not (register and equals and value):
-        raise click.BadParameter(f"{text!r}: write REGISTER=VALUE, for example torque_limit=60", param_hint="REGISTER=VALUE")
-    return register, number_or_name(value)
+    on_rig(options, action, [name], before=check)
 
 
 def number_or_name(text: str) -> int | float | str:
