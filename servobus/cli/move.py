@@ -1,6 +1,6 @@
 """Commands that move or stop: move, enable, disable, stop, clear.
 
-A command without a daemon opens the ports, and when it ends it leaves each servo that it enabled as the servo's `on_exit` says.
+A command without a daemon opens the ports. When it ends, it does the `on_exit` of each servo that it enabled.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def move(
     """Move servos and wait until they arrive.
 
     Positions are in each servo's unit (degrees if the config names none). A goal outside a limit is refused before a port is
-    opened. Through a daemon the servos must be enabled, and stay enabled. Without a daemon they are enabled first, and left as
-    their `on_exit` says at the end. Ctrl-C stops the motion: by `on_lost_client` through a daemon, else by `on_exit`.
+    opened. Through a daemon the servos must be enabled, and stay enabled. Without a daemon they are enabled first, and their
+    `on_exit` is done at the end. Ctrl-C stops the motion: by `on_lost_client` through a daemon, else by `on_exit`.
 
     Example: servobus move shoulder=10 elbow=-20 --speed 30
     """
@@ -96,7 +96,7 @@ def _by_full_name(positions: Mapping[str, float], full_name: Callable[[str], str
 def enable(options: Options, names: tuple[str, ...]) -> None:
     """Switch torque on; each servo holds its present position. Without a NAME all servos are enabled.
 
-    A daemon keeps them enabled. Without a daemon they are left as their `on_exit` says at once: with `hold` they stay energised.
+    A daemon keeps them enabled. Without a daemon their `on_exit` is done at once: with `hold` they stay energised.
 
     Example: servobus enable elbow
     """
@@ -132,7 +132,7 @@ def disable(options: Options, names: tuple[str, ...]) -> None:
 @click.command()
 @servo_options
 def stop(options: Options) -> int:
-    """E-stop all servos of all buses. Each one stops as its `on_estop` says; a servo that is limp stays limp.
+    """E-stop all servos of all buses. Each servo does its `on_estop`; a limp servo stays limp.
 
     Prints what each servo confirmed. A daemon latches the e-stop until `servobus clear`. A bus whose port cannot be opened does
     not keep the others from being stopped. The exit status is 1 unless every servo confirmed.

@@ -14,7 +14,7 @@ from servobus.values import State
 
 ENCODING_ERRORS = "servobus.replace"
 SUBSTITUTES = {"°": " ", "µ": "u", "…": ".", "│": "|", "─": "-", "━": "-"}
-"""Character -> what stands for it in an encoding that lacks it: one character each, so that columns stay aligned."""
+"""Character -> its substitute in an encoding that lacks it, of one character, so that columns stay aligned."""
 STATE_COLUMNS = ("servo", "position", "goal", "speed", "load%", "V", "°C", "A", "state", "health", "faults")
 """Narrow enough for a terminal of 80 columns."""
 

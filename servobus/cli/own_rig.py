@@ -65,7 +65,7 @@ async def open_own(
         raise await _with_hint(error) from None
     doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]
     if doubtful:
-        raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; look before you touch")
+        raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; check the servo before you touch it")
 
 
 async def _buses_of(config: Config) -> Mapping[str, BusFacts]:

@@ -68,7 +68,7 @@ def _print(options: Options, target: ScanTarget, hits: Sequence[servobus.ScanHit
     if options.as_json:
         emit([dataclasses.asdict(hit) for hit in hits])
     elif not hits:
-        echo("nobody answered: is the power on, are the baud rates right, is another program on the line?", err=True)
+        echo("no servo answered: check the power, the baud rates, and whether another program uses the line", err=True)
     elif as_yaml:
         from servobus.cli.starter import starter
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from servobus.cli.output import show
 
 FILE_WIDTH = 200
-"""Columns where the output is no terminal: nobody wraps a file."""
+"""Width in characters where the output is not a terminal, so that no row is folded."""
 
 
 def table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> Table:

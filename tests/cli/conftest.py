@@ -1,4 +1,4 @@
-"""Commands set up logging for a whole process; a test's process goes on. And what tests of processes start with."""
+"""Fixtures of the commands: the logging of the process is restored, a config file, a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands as processes, and a terminal for them."""
+"""Runs commands as processes, also on a terminal."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def servobus(
 
 
 class Terminal:
-    """80 columns wide. `end` is for the program; what it writes there is read here."""
+    """A pseudo-terminal of 80 columns. The program writes to `end`, and the test reads."""
 
     def __init__(self) -> None:
         ours, theirs = os.openpty()
@@ -46,7 +46,7 @@ class Terminal:
         return (self._ours.read(65536) or b"").decode()
 
     def rest(self) -> str:
-        """Everything written until all writers are gone."""
+        """Returns everything that is written until all writers have ended."""
         self.end.close()
         output = ""
         with suppress(OSError):  # how Linux says that no writer is left
@@ -60,7 +60,7 @@ class Terminal:
 
 
 def until(process: subprocess.Popen[str], event: str) -> dict[str, object]:
-    """The first log line of that name."""
+    """Returns the first log record of this event."""
     assert process.stderr is not None
     for line in process.stderr:
         record: dict[str, object] = json.loads(line)

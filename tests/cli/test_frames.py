@@ -1,4 +1,4 @@
-"""Frames out of the pieces in which a line delivers them."""
+"""The printer of frames: a line delivers frames in pieces, and it prints each frame once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TWO = bytes.fromhex("FFFF020200FB")
 
 
 class TracerLines:
-    """A tracer of one bus, and its lines without their times."""
+    """A tracer of one bus, and the lines that it printed."""
 
     def __init__(self, *, replies: bool = True) -> None:
         self.lines: list[str] = []

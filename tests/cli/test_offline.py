@@ -1,4 +1,4 @@
-"""check, schema, decode, ports: what needs no line."""
+"""The commands that open no port: check, schema, decode, ports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands share: how a rig is opened and left, how cells and numbers are shown."""
+"""What the commands share: the rig that they open and leave, and the cells of tables."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def options(tmp_path: Path) -> Options:
 
 
 def silence(rig: Rig) -> None:
-    """From here on nobody answers."""
+    """Ends the line, so that no servo answers any more."""
     cast("SimulatedLink", cast("LocalRig", rig).supervisors["arm"].link).line.close()
 
 
 async def test_an_unconfirmed_exit_policy_is_an_error(options: Options) -> None:
-    with pytest.raises(DeviceError, match=r"how it was left: arm/shoulder \(hold: .+\); look") as caught:  # noqa: PT012 - at the end
+    with pytest.raises(DeviceError, match=r"how it was left: arm/shoulder \(hold: .+\); check") as caught:  # noqa: PT012 - at the end
         async with open_context(options, ["shoulder"]) as context:
             await context.rig.enable("shoulder")
             silence(context.rig)

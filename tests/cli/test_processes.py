@@ -1,4 +1,4 @@
-"""Commands that stay, as processes: what they print, and how they end by signals."""
+"""Commands as processes: run, sim, and others that a signal or a closed pipe ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The start of the command line: what `--help` imports, and the table of commands beside the commands themselves."""
+"""The start of the command line: what `--help` imports, and whether the table of commands agrees with the commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The config that `scan --yaml` writes: accepted as it is, whatever was found."""
+"""The config that `scan --yaml` prints: it is valid for every list of hits."""
 
 from __future__ import annotations
 

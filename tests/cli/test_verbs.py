@@ -146,7 +146,7 @@ def test_scan_that_finds_nobody(call: Call) -> None:
     assert call("scan", "arm", "--ids", "200-201", "--json") == 1
     assert call.out == "[]\n"
     assert call("scan", "arm", "--ids", "200") == 1
-    assert "nobody answered" in call.err
+    assert "no servo answered" in call.err
     assert call("scan", "arm", "--ids", "200", "--yaml") == 1
     assert call.out == ""
 

@@ -1,4 +1,4 @@
-"""The schema that editors are given: it says of a config what reading it says, as far as a schema can."""
+"""The JSON Schema for editors: it accepts and refuses the same configs as the loader, as far as a schema can."""
 
 from __future__ import annotations
 
