@@ -32,12 +32,11 @@ def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | No
     """
 
     async def action(context: RigContext) -> None:
-        if options.as_json:
-            await _show(context, names, hz, _updates(hz, count, seconds), emit)
-        elif not sys.stdout.isatty():
-            await _show(context, names, hz, _updates(hz, count, seconds), _print_lines)
+        updates = _updates(hz, count, seconds)
+        if sys.stdout.isatty() and not options.as_json:
+            await _show_live(context, names, hz, updates)
         else:
-            await _show_live(context, names, hz, _updates(hz, count, seconds))
+            await _show(context, names, hz, updates, emit if options.as_json else _print_lines)
 
     on_rig(options, action, names)
 

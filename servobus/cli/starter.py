@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import io
+import json
 from collections.abc import Sequence
-
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
 
 from servobus.cli.scan import ScanTarget
 from servobus.protocols.registry import PROTOCOLS
 from servobus.values import ScanHit
 
 HEAD = "# Written by `servobus scan --yaml`. Give the servos names of yours, and limits before anything moves.\n"
+BUS = """\
+version: 1
+buses:
+  {bus}:
+    protocol: {protocol}
+    port: {port}
+    baudrate: {rate}
+    poll: {{feedback: 20}}
+    servos:{servos}
+"""
 
 
 def starter(target: ScanTarget, hits: Sequence[ScanHit]) -> str:
@@ -22,25 +29,18 @@ def starter(target: ScanTarget, hits: Sequence[ScanHit]) -> str:
     """
     rate = max((hit.baudrate for hit in hits), key=lambda rate: sum(hit.baudrate == rate for hit in hits))
     usable = [hit for hit in hits if hit.baudrate == rate and hit.model]
-    notes = "".join(
-        f"# Not in it: id {hit.id} at {hit.baudrate} baud, {_reason(hit, rate)}\n" for hit in hits if hit not in usable
-    )
-    text = io.StringIO()
-    YAML().dump(_document(target, usable, rate), text)
-    return f"{HEAD}{notes}{text.getvalue()}"
+    notes = [f"# Not in it: id {hit.id} at {hit.baudrate} baud, {_reason(hit, rate)}\n" for hit in hits if hit not in usable]
+    servos = "".join(_servos(target.protocol, hit) for hit in usable) or " {}"
+    port = json.dumps(target.port)
+    return HEAD + "".join(notes) + BUS.format(bus=target.bus, protocol=target.protocol, port=port, rate=rate, servos=servos)
 
 
-def _document(target: ScanTarget, hits: Sequence[ScanHit], rate: int) -> CommentedMap:
-    write = PROTOCOLS[target.protocol].starter
-    servos = CommentedMap((servo, CommentedMap(keys)) for hit in hits for servo, keys in write(hit.id, hit.model or "").items())
-    poll = CommentedMap(feedback=20)
-    for part in (poll, *(servos.values() or [servos])):
-        part.fa.set_flow_style()
-    bus = CommentedMap(protocol=target.protocol, port=target.port, baudrate=rate, poll=poll, servos=servos)
-    return CommentedMap(version=1, buses=CommentedMap({target.bus: bus}))
+def _servos(protocol: str, hit: ScanHit) -> str:
+    servos = PROTOCOLS[protocol].starter(hit.id, hit.model or "").items()
+    return "".join(f"\n      {name}: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}" for name, keys in servos)
 
 
 def _reason(hit: ScanHit, rate: int) -> str:
     if hit.baudrate != rate:
         return f"{hit.model or 'unknown model'}: a line has one rate, and most servos here answer at {rate}"
-    return f"no model file fits it ({hit.note or hit.product or 'it does not say who it is'}): name one, or write your own"
+    return f"no model file fits it ({hit.note or hit.product or 'it does not report its model'}): name one, or write your own"
