@@ -20,11 +20,7 @@ def run(
     """Run a coroutine in an event loop of its own.
 
     Ctrl-C and each of `signals` cancel it, so that exit policies are applied. A second one of `signals` ends the process at once.
-
-    Args:
-        main: Makes the coroutine.
-        terminated: Exit status after one of `signals`; after Ctrl-C it is 130.
-        signals: The signals that end it: SIGTERM, and SIGHUP of a terminal that is closed.
+    The exit status after one of `signals` is `terminated`; after Ctrl-C it is 130.
     """
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_until_signalled(main, terminated, signals))

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from servobus.cli.options import Number, Options, RigContext, on_rig, servo_options
-from servobus.cli.output import STATE_COLUMNS, echo, echo_table, emit, show, state_row
+from servobus.cli.output import STATE_COLUMNS, echo, echo_table, emit, show, state_row, table
 from servobus.values import State
 
 MAX_HZ = 50.0
@@ -56,8 +56,6 @@ def _print_lines(snapshot: Mapping[str, State]) -> None:
 async def _show_live(context: RigContext, names: tuple[str, ...], hz: float, count: int | None) -> None:
     from rich.console import Console
     from rich.live import Live
-
-    from servobus.cli.tables import table
 
     def update(snapshot: Mapping[str, State]) -> None:
         rows = [state_row(name, state) for name, state in snapshot.items()]

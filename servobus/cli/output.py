@@ -1,4 +1,7 @@
-"""What the commands print: lines, JSON for machines, tables for people. A stream of any encoding takes it."""
+"""What the commands print: lines, JSON for machines, tables for people; on a stream of any encoding.
+
+rich, which makes the tables, is imported with the first table.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from servobus.values import State
 ENCODING_ERRORS = "servobus.replace"
 SUBSTITUTES = {"°": " ", "µ": "u", "…": ".", "│": "|", "─": "-", "━": "-"}
 """Character -> its substitute in an encoding that lacks it, of one character, so that columns stay aligned."""
+FILE_WIDTH = 200  # characters, so that no row is folded in a file
 STATE_COLUMNS = ("servo", "position", "goal", "speed", "load%", "V", "°C", "A", "state", "health", "faults")
 """Narrow enough for a terminal of 80 columns."""
 
@@ -49,11 +53,36 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def echo_table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> None:
-    """Print a table, see `tables.table`."""
-    from servobus.cli.tables import print_table
+def table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> Any:
+    """Make a rich Table with numbers on the right and text on the left.
 
-    print_table(title, columns, rows, narrow=narrow)
+    `narrow` puts columns close together, and lets only the last one be folded.
+    """
+    from rich.table import Table
+
+    made = Table(title=title, box=None, pad_edge=False, header_style="bold", collapse_padding=narrow)
+    cells, headings = [[show(cell) for cell in row] for row in rows], list(columns)
+    for index, heading in enumerate(headings):
+        numeric = bool(cells) and all(_is_number(row[index]) for row in cells)
+        no_wrap = narrow and index < len(headings) - 1
+        made.add_column(heading, justify="right" if numeric else "left", overflow="fold", no_wrap=no_wrap)
+    for row in cells:
+        made.add_row(*row)
+    return made
+
+
+def _is_number(text: str) -> bool:
+    return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
+
+
+def echo_table(title: str | None, columns: Iterable[str], rows: Iterable[Iterable[object]], *, narrow: bool = False) -> None:
+    """Print a table; where the output is not a terminal, no row is folded."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console.width = FILE_WIDTH
+    console.print(table(title, columns, rows, narrow=narrow), highlight=False)
 
 
 def report(as_json: bool, data: Any, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

@@ -8,9 +8,8 @@ from typing import cast
 import pytest
 
 from servobus.cli.options import Options
-from servobus.cli.output import show
+from servobus.cli.output import show, table
 from servobus.cli.rig_context import open_context
-from servobus.cli.tables import table
 from servobus.errors import DeviceError
 from servobus.rig.interface import Rig
 from servobus.rig.local import LocalRig
