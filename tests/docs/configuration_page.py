@@ -218,41 +218,41 @@ def _section(section: Section) -> str:
 
 
 def _rows(model: type[BaseModel]) -> Iterator[str]:
-    schema = model.model_json_schema()
+    whole = model.model_json_schema()
     for key in own_keys(model):
-        entry = schema["properties"][key]
+        schema = whole["properties"][key]
         unit, example = KEYS[model][key]
-        meaning = " ".join(entry["description"].split())
-        default = "required" if key in schema.get("required", ()) else _default(entry)
-        cells = (f"`{key}`", unit, _type(entry), default, f"`{example}`", meaning)
+        meaning = " ".join(schema["description"].split())
+        default = "required" if key in whole.get("required", ()) else _default(schema)
+        cells = (f"`{key}`", unit, _type(schema), default, f"`{example}`", meaning)
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
-def _default(entry: Mapping[str, Any]) -> str:
-    default = entry.get("default")
+def _default(schema: Mapping[str, Any]) -> str:
+    default = schema.get("default")
     if default is None or default in ([], {}, "") or (isinstance(default, dict) and not any(default.values())):
         return ""
     text = default if isinstance(default, str) else re.sub(r'"|\.0\b', "", json.dumps(default))
     return f"`{text}`"
 
 
-def _type(entry: Mapping[str, Any]) -> str:
+def _type(schema: Mapping[str, Any]) -> str:
     """A schema in a few words."""
-    if "anyOf" in entry:
-        (entry,) = (each for each in entry["anyOf"] if each.get("type") != "null")
-    if "enum" in entry or "const" in entry:
-        values = [f"`{value}`" for value in entry.get("enum", [entry.get("const")])]
+    if "anyOf" in schema:
+        (schema,) = (each for each in schema["anyOf"] if each.get("type") != "null")
+    if "enum" in schema or "const" in schema:
+        values = [f"`{value}`" for value in schema.get("enum", [schema.get("const")])]
         return " or ".join(filter(None, (", ".join(values[:-1]), values[-1])))
-    if "prefixItems" in entry:
-        return f"list of {entry['maxItems']}: {_type(entry['prefixItems'][0])}"
-    if entry.get("pattern", "").startswith("^("):
-        return _type({"enum": entry["pattern"][2:-2].split("|")})
+    if "prefixItems" in schema:
+        return f"list of {schema['maxItems']}: {_type(schema['prefixItems'][0])}"
+    if schema.get("pattern", "").startswith("^("):
+        return _type({"enum": schema["pattern"][2:-2].split("|")})
     kinds = {"boolean": "`true` or `false`", "string": "text", "array": "list of text", "object": "mapping", None: "mapping"}
-    return kinds.get(entry.get("type")) or f"{entry['type']}{_range(entry)}"
+    return kinds.get(schema.get("type")) or f"{schema['type']}{_range(schema)}"
 
 
-def _range(entry: Mapping[str, Any]) -> str:
-    low, above, high = entry.get("minimum"), entry.get("exclusiveMinimum"), entry.get("maximum")
+def _range(schema: Mapping[str, Any]) -> str:
+    low, above, high = schema.get("minimum"), schema.get("exclusiveMinimum"), schema.get("maximum")
     if low is not None and high is not None:
         return f", {low:.9g} to {high:.9g}"
     bounds = {"at least": low, "above": above, "at most": high}
