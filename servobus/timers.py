@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import math
 import os
 import time
 from collections.abc import Callable
@@ -105,17 +106,19 @@ class CoarseTimer:
         self._clock = clock_of(loop)
         self._callback = callback
         self._handle: asyncio.TimerHandle | None = None
-        self._at = 0.0
+        self.at = math.inf
+        """When it calls back; infinite: it is not set."""
 
     def by(self, when: float) -> None:
         """At `when` (seconds of `clock_of`) at the latest."""
+        if self.at <= when:
+            return
         if self._handle is not None:
-            if self._at <= when:
-                return
             self._handle.cancel()
-        self._at = when
+        self.at = when
         self._handle = self._loop.call_later(max(0.0, when - self._clock()), self._fire)
 
     def _fire(self) -> None:
         self._handle = None
+        self.at = math.inf
         self._callback()

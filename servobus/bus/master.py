@@ -52,8 +52,7 @@ class BusMaster(asyncio.Protocol):
     def submit(self, job: Job) -> None:
         """Queue a request or a plan. Raises LinkDown, Overloaded."""
         now = self._clock()
-        self.engine.submit(job, now)
-        if self.engine.idle:
+        if self.engine.submit(job, now):
             self._pump(now)
 
     def submit_stop(self, job: Job) -> None:
@@ -115,7 +114,7 @@ class BusMaster(asyncio.Protocol):
             if self.trace is not None:
                 self.trace(True, action.frame, now)
             transport.write(action.frame)
-            if action.deadline is not None:
+            if action.deadline is not None and action.deadline < self._deadline.at:
                 self._deadline.by(action.deadline)
         if isinstance(action, WaitUntil):
             self._wake.by(action.when)

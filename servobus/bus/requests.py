@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from servobus.bus.master import BusMaster
 from servobus.bus.records import ServoRecord
@@ -20,6 +20,7 @@ from servobus.protocols.options import BusOptions
 
 R = TypeVar("R")
 
+ORDINARY = JobKind.ORDINARY
 PATIENCE = 2.0
 """Seconds for which a request may wait for its turn."""
 DOWN_PAUSE = 0.02
@@ -70,15 +71,14 @@ class Requests:
 
         Raises ReplyTimeout, DeviceError, LinkDown, Overloaded.
         """
-        job = Job(
-            self._loop.create_future(),
-            self._parts.clock() + PATIENCE,
-            request=request,
-            even_if_offline=even_if_offline,
-            session=session,
-            tries=tries,
-        )
-        return self._result(job, servo)
+        future: asyncio.Future[R] = self._loop.create_future()
+        expires = self._parts.clock() + PATIENCE
+        job = Job(future, expires, request, None, 0, ORDINARY, even_if_offline, session, tries)
+        return self._result(job, future, servo)
+
+    def read_register(self, servo: str, register: str, *, raw: bool = False) -> Coroutine[Any, Any, Any]:
+        """Read one register: its physical value, or its integer with `raw`. Raises as `ask`, UnknownName, NotSupported."""
+        return self.ask(self._parts.driver.read_register(servo, register, raw=raw), servo=servo)
 
     def perform(
         self,
@@ -86,30 +86,24 @@ class Requests:
         node: int,
         *,
         servo: str | None = None,
-        kind: JobKind = JobKind.ORDINARY,
+        kind: JobKind = ORDINARY,
         even_if_offline: bool = False,
         session: object = None,
     ) -> Coroutine[Any, Any, R]:
         """Run a plan and return its result; only an e-stop comes between its frames. Raises as `ask`."""
-        job = Job(
-            self._loop.create_future(),
-            self._parts.clock() + PATIENCE,
-            plan=plan,
-            node=node,
-            kind=kind,
-            even_if_offline=even_if_offline,
-            session=session,
-        )
-        return self._result(job, servo)
+        future: asyncio.Future[R] = self._loop.create_future()
+        expires = self._parts.clock() + PATIENCE
+        job = Job(future, expires, None, plan, node, kind, even_if_offline, session)
+        return self._result(job, future, servo)
 
-    async def _result(self, job: Job, servo: str | None) -> Any:
+    async def _result(self, job: Job, future: asyncio.Future[R], servo: str | None) -> R:
         try:
             self._parts.master.submit(job)
         except ServobusError as error:
             job.fail(error)
             await asyncio.sleep(DOWN_PAUSE)
         try:
-            return await cast("asyncio.Future[Any]", job.sink)
+            return await future
         except ServobusError as error:
             failure = error.at(bus=self._parts.name, servo=servo)
         if isinstance(failure, DeviceError) and job.plan is None and servo is not None:

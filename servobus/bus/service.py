@@ -74,6 +74,7 @@ class BusService:
         requests = Requests(self.parts)
         self.ask = requests.ask
         self.perform = requests.perform
+        self.read_register = requests.read_register
         self.discovery = Discovery(self.parts, requests, self.read)
         self.identify = self.discovery.identify
         self.motion = Motion(self.parts, requests, identify=self.identify, read=self.read)
@@ -116,9 +117,6 @@ class BusService:
         """Return the newest state of a servo, without a turn."""
         record = self.records[servo]
         return record.state(self.clock(), self.driver.fault_names(servo, record.node.status))
-
-    def read_register(self, servo: str, register: str, *, raw: bool = False) -> Coroutine[Any, Any, Any]:
-        return self.ask(self.driver.read_register(servo, register, raw=raw), servo=servo)
 
     async def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
         enabled = [record.name for record in self.parts.on(self.records[servo].node) if record.enabled]

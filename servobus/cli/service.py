@@ -35,6 +35,7 @@ def run(config: str, log_every: float) -> None:
     from servobus.rpc.socket_path import socket_path
 
     set_up_logs(logging.INFO)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon reads its config again at each SIGHUP
     load_config(config)  # a wrong config is refused before the socket is claimed
     if Path(config).stat().st_mode & stat.S_IWOTH:
         raise ConfigError(f"{config}: every user may write to it, and so decide what this daemon does: run chmod o-w {config}")

@@ -56,6 +56,8 @@ class Idle:
     """Nothing is to be done before something happens."""
 
 
+FOLD_MASK = 1023
+"""The histogram of the turns is folded whenever their number has these bits clear."""
 IDLE: Final = Idle()
 Action: TypeAlias = Transmit | WaitUntil | Idle
 
@@ -82,6 +84,8 @@ class Engine:
         """A turn of a plain job whose value was not delivered yet: the next frame goes first."""
         self._unanswered: Job | None = None
         """The job of a frame to which no reply is due, and which is being handed over now."""
+        self._buffering = False
+        """The codec was given bytes since it was reset."""
 
     def __repr__(self) -> str:
         servos = sum(node.configured for node in self.nodes.by_id.values())
@@ -109,11 +113,22 @@ class Engine:
 
     # Callers
 
-    def submit(self, job: Job, now: float) -> None:
-        """Queue a request or a plan. Raises LinkDown, Overloaded."""
+    def submit(self, job: Job, now: float) -> bool:
+        """Queue a request or a plan; return whether the next action may be due now. Raises LinkDown, Overloaded."""
         if not self.up:
             raise LinkDown("the line is down: it is opened again as soon as the port is back; retry then", bus=self.bus)
+        if (
+            self._job is None
+            and self._turn is None
+            and job.plan is None
+            and self._suspended is None
+            and self.line.is_ready(now)
+            and self.scheduler.begins_at_once(job, now)
+        ):
+            self._job = job
+            return True
         self.scheduler.queue(job, now)
+        return self.idle
 
     def submit_stop(self, job: Job) -> None:
         """Put a stop before all that waits. An e-stop also drops what moves, and interrupts the plan under way. Raises
@@ -131,12 +146,12 @@ class Engine:
 
     def opened(self, now: float) -> None:
         self.up = True
-        self._codec.reset()
+        self._reset_codec()
         self.nodes.suspect_all()
         self.line.opened(now)
 
     def baudrate_changed(self, baudrate: int, now: float) -> None:
-        self.line.traits = replace(self.line.traits, baudrate=baudrate)
+        self.line.use(replace(self.line.traits, baudrate=baudrate))
         self.line.wait_for_silence(now)
 
     def lost(self, cause: Exception | None) -> None:
@@ -172,21 +187,19 @@ class Engine:
                 self.deliver()
             return IDLE
         line = self.line
-        if now < line.quiet_until or now < line.last_start or line.waiting_for_silence:
+        if not line.is_ready(now):
             ready = line.ready_at(now, estop_pending=self.estop_pending)
             if ready > now:
                 return self._wait_for_line(ready, now)
             if line.waiting_for_silence:
-                self._codec.reset()
+                self._reset_codec()
                 line.end_wait()
         request = self._next_request(now)
         if request is not None:
             return self._transmit(request, now)
         if self._ended is not None:
             self.deliver()
-            return self.next_action(now)
-        self.scheduler.expire(now)
-        when = self.scheduler.wake()
+        when = self.scheduler.rest(now)
         return IDLE if when is None else WaitUntil(when)
 
     @property
@@ -219,7 +232,14 @@ class Engine:
     def _current_job(self, now: float) -> Job | None:
         """Return the job that has the line, begun if need be."""
         job = self._job
-        if job is not None and job.kind is not ESTOP and self.scheduler.estop_pending:
+        if job is None:
+            if self._suspended is None:
+                job = self.scheduler.next_job(now)
+                if job is None or job.plan is None:  # nearly always
+                    self._job = job
+                    return job
+                self._begin(job)
+        elif job.kind is not ESTOP and self.scheduler.estop_pending:
             self._make_way(job)
         while self._job is None:
             if self._suspended is not None and not self.scheduler.estop_pending:
@@ -228,11 +248,14 @@ class Engine:
             job = self.scheduler.next_job(now)
             if job is None:
                 return None
-            self._job = job
-            if job.plan is not None:
-                self.stats.counts[Counter.FENCES] += job.kind is JobKind.PROBE
-                self._apply(job, job.begin())
+            self._begin(job)
         return self._job
+
+    def _begin(self, job: Job) -> None:
+        self._job = job
+        if job.plan is not None:
+            self.stats.counts[Counter.FENCES] += job.kind is JobKind.PROBE
+            self._apply(job, job.begin())
 
     def _make_way(self, job: Job) -> None:
         self._job = None
@@ -242,8 +265,9 @@ class Engine:
             self._suspended = job
 
     def _doubtful_node(self, request: Request[Any]) -> Node | None:
+        by_id = self.nodes.by_id
         for node_id in request.nodes:
-            node = self.nodes.node(node_id)
+            node = by_id.get(node_id) or self.nodes.node(node_id)
             if node.health is not ONLINE:
                 return node
         return None
@@ -274,8 +298,13 @@ class Engine:
         return slowest + self.line.traits.latency + request.service_time
 
     def _begin_turn(self, turn: Turn) -> None:
-        self._codec.reset()
+        if self._buffering:
+            self._reset_codec()
         self._turn = turn
+
+    def _reset_codec(self) -> None:
+        self._codec.reset()
+        self._buffering = False
 
     # What is received
 
@@ -285,9 +314,17 @@ class Engine:
         line, turn = self.line, self._turn
         if line.echo is not None and not (data := line.echo.strip(data)):
             return
-        if turn is None or (line.traits.paced and self._is_early(len(data), now, turn)):
+        if turn is None or (line.paced and self._is_early(len(data), now, turn)):
             self._unsolicited(data, now)
             return
+        if not self._buffering and data != turn.frame and not turn.replies:
+            reply = turn.request.whole_reply(data)
+            if reply is not None:
+                # Nearly always the bytes are exactly the reply that is due: the codec and `judge` would find the same.
+                turn.replies.append(reply)
+                self._answered(turn, now)
+                return
+        self._buffering = True
         self._codec.receive_data(data)
         window, strays = self._judge(turn)
         if strays:
@@ -315,7 +352,7 @@ class Engine:
         while (reply := self._codec.next_reply()) is not None:
             strays.append(reply)
         self._strays(strays, None, now)
-        self._codec.reset()  # the rest of them is not the beginning of a reply
+        self._reset_codec()  # the rest of them is not the beginning of a reply
         if self._turn is None:
             self.line.wait_for_silence(now)
 
@@ -351,19 +388,21 @@ class Engine:
         if turn.echoes:
             counts[ECHOES] += turn.echoes
         self.stats.turns.add(now - turn.sent_at)
+        if not counts[TURNS] & FOLD_MASK:
+            self.stats.turns.fold()
         if self._turn is None:
             self.line.answered(now, request.quiet_after)
-        latency = self._latency(turn, now)
+        latency = now - turn.sent_by - len(turn.replies) * request.reply_size * self.line.byte_time
         by_id = self.nodes.by_id
         for reply in turn.replies:
             node = by_id.get(reply.node) or self.nodes.node(reply.node)
-            node.answered(reply.status)
-            node.learn(latency)
+            node.replied(reply.status, latency)
         job = turn.job
-        if job.plain:
+        if job.plan is None and not job.fencing:
             if self._job is job:
                 self._job = None
-            self.deliver()
+            if self._ended is not None:
+                self.deliver()
             self._ended = turn
         else:
             self._conclude(job, request, turn.replies)
@@ -387,10 +426,6 @@ class Engine:
 
     def _end_turn(self, turn: Turn) -> None:
         self._turn = None
-
-    def _latency(self, turn: Turn, now: float) -> float:
-        """Return what the replies took beyond the wire time."""
-        return now - turn.sent_by - len(turn.replies) * turn.request.reply_size * self.line.byte_time
 
     def _retry(self, turn: Turn, now: float) -> None:
         """Send the request once more, or give it up: case 3 above."""
@@ -439,10 +474,11 @@ class Engine:
         except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its job, never the bus
             self._apply(job, job.give_up(error))
             return
-        if job.plain:
+        if job.plan is None and not job.fencing:
             if self._job is job:
                 self._job = None
-            job.succeed(value)
+            if not job.sink.done():
+                job.sink.set_result(value)
         else:
             self._apply(job, job.advance(value))
 

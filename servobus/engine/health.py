@@ -61,6 +61,12 @@ class Node:
         self._mean: float | None = None
         self._spread = 0.0
 
+    def replied(self, status: int | None, latency: float) -> None:
+        """Note a reply that was believed, and how long it took beyond the wire time."""
+        self.status = status
+        self.misses = 0
+        self.learn(latency)
+
     def learn(self, latency: float) -> None:
         """Adapt the allowance as TCP adapts its retransmission timer: smoothed mean plus four times the spread."""
         if latency < 0.0:
@@ -80,7 +86,7 @@ class Node:
         self.reply_allowance_s = wanted if wanted < self.max_allowance_s else self.max_allowance_s
 
     def answered(self, status: int | None) -> None:
-        """Note a reply that was believed."""
+        """Note a reply that was believed; how long it took is not known."""
         self.status = status
         self.misses = 0
 

@@ -101,6 +101,7 @@ class Job:
         "attempts",
         "even_if_offline",
         "expires",
+        "fencing",
         "kind",
         "node",
         "plan",
@@ -145,6 +146,8 @@ class Job:
         """How often one of its idempotent requests may be sent."""
         self.attempts = 0
         """How often the present request was sent in vain."""
+        self.fencing = kind is JobKind.PROBE
+        """Its present request belongs to a fence."""
         self._fence: Plan[bool] | None = None
 
     # Its result
@@ -163,14 +166,9 @@ class Job:
     # Its steps
 
     @property
-    def fencing(self) -> bool:
-        """Its present request belongs to a fence."""
-        return self._fence is not None or self.kind is JobKind.PROBE
-
-    @property
     def plain(self) -> bool:
         """One request, and no fence is under way before it."""
-        return self.plan is None and self._fence is None
+        return self.plan is None and not self.fencing
 
     def begin(self) -> Step:
         """Return the first step."""
@@ -178,7 +176,7 @@ class Job:
 
     def put_fence(self, fence: Plan[bool]) -> Step:
         """Put a fence before the present request."""
-        self._fence, self._resume = fence, (self.request, self.attempts)
+        self._fence, self._resume, self.fencing = fence, (self.request, self.attempts), True
         return self._in_fence(_send(fence, None))
 
     def advance(self, value: Any) -> Step:
@@ -205,7 +203,7 @@ class Job:
             self.request, self.attempts = step.request, 0
             return step
         self.request, self.attempts = self._resume
-        self._fence = None
+        self._fence, self.fencing = None, self.kind is JobKind.PROBE
         if isinstance(step, Failed):
             self.attempts += 1
             if last or self.attempts >= self.tries or not isinstance(step.error, ReplyTimeout):

@@ -54,10 +54,25 @@ class EchoFilter:
 class Line:
     """The state of one half-duplex line as its master knows it."""
 
-    __slots__ = ("_traits", "_waiting_since", "babbling", "byte_time", "drains", "echo", "last_start", "quiet_until", "sent_by")
+    __slots__ = (
+        "_waiting_since",
+        "babbling",
+        "byte_time",
+        "drains",
+        "echo",
+        "gap",
+        "last_start",
+        "paced",
+        "quiet_until",
+        "sent_by",
+        "traits",
+        "waiting_for_silence",
+    )
+
+    traits: LineTraits
 
     def __init__(self, traits: LineTraits) -> None:
-        self.traits = traits
+        self.use(traits)
         self.echo: EchoFilter | None = None
         self.babbling = False
         """Bytes arrived without a pause for too long, and the line was not silent since. Only an e-stop is transmitted."""
@@ -69,43 +84,42 @@ class Line:
         """When the last frame begins to leave: until then no other is handed over."""
         self.quiet_until = 0.0
         """Until then nothing is transmitted."""
-        self._waiting_since: float | None = None
+        self.waiting_for_silence = False
+        self._waiting_since = 0.0
 
-    @property
-    def traits(self) -> LineTraits:
-        return self._traits
-
-    @traits.setter
-    def traits(self, traits: LineTraits) -> None:
-        self._traits = traits
+    def use(self, traits: LineTraits) -> None:
+        """Take over what the link knows of its line."""
+        self.traits = traits
         self.byte_time = traits.byte_time
-
-    @property
-    def waiting_for_silence(self) -> bool:
-        return self._waiting_since is not None
+        self.gap = traits.gap
+        self.paced = traits.paced
 
     def opened(self, now: float) -> None:
         self.sent_by = self.last_start = now
-        self._waiting_since = None
+        self.waiting_for_silence = False
         self.quiet_until = 0.0
         self.babbling = False
         self.wait_for_silence(now, START_QUIET)
 
     def wait_for_silence(self, now: float, quiet: float = QUIET) -> None:
         """Transmit nothing until `quiet` seconds passed without a byte. A longer silence that is due already is kept."""
-        if self._waiting_since is None:
+        if not self.waiting_for_silence:
+            self.waiting_for_silence = True
             self._waiting_since = now
             self.drains += 1
-        traits = self._traits
-        self.quiet_until = max(self.quiet_until, now + max(quiet, traits.gap, traits.latency, 2 * self.byte_time))
+        self.quiet_until = max(self.quiet_until, now + max(quiet, self.gap, self.traits.latency, 2 * self.byte_time))
+
+    def is_ready(self, now: float) -> bool:
+        """Return whether a frame may be handed over now and no silence had to be waited for: nearly always."""
+        return now >= self.quiet_until and now >= self.last_start and not self.waiting_for_silence
 
     def ready_at(self, now: float, *, estop_pending: bool) -> float:
         """Return when the next frame may be handed over. A time that is not after `now` means at once."""
         if now >= self.quiet_until:
-            if self._waiting_since is not None:
+            if self.waiting_for_silence:
                 self.babbling = False
             return self.last_start
-        if self._waiting_since is not None:
+        if self.waiting_for_silence:
             self.babbling = self.babbling or now - self._waiting_since > BABBLE
         if self.babbling and estop_pending:  # a node that never stops sending does not hold back an e-stop
             return self.last_start
@@ -113,7 +127,7 @@ class Line:
 
     def end_wait(self) -> None:
         """Note that the silence has passed and a frame follows."""
-        self._waiting_since = None
+        self.waiting_for_silence = False
         if self.echo is not None:
             self.echo.reset()
 
@@ -123,8 +137,7 @@ class Line:
         start = now if now > self.sent_by else self.sent_by
         self.last_start = start
         self.sent_by = start + len(frame) * self.byte_time
-        gap = self._traits.gap
-        silence = quiet_after if quiet_after > gap else gap
+        silence = quiet_after if quiet_after > self.gap else self.gap
         self.quiet_until = self.sent_by + silence if silence else 0.0
         if self.echo is not None:
             self.echo.sent(frame)
@@ -135,6 +148,6 @@ class Line:
         none). The silence that must follow begins."""
         if self.sent_by > now:
             self.sent_by = self.last_start = now
-        silence = max(quiet_after, self._traits.gap)
+        silence = quiet_after if quiet_after > self.gap else self.gap
         if silence:
             self.quiet_until = now + silence

@@ -31,7 +31,12 @@ class RequestQueue:
         """Append a job. Raises Overloaded when the queue is full."""
         if self.length >= self._limit:
             raise overloaded(self.length)
-        self.put_always(job)
+        jobs = self._by_node.get(job.node)  # as `put_always`, without its call
+        if jobs is None:
+            self._by_node[job.node] = deque((job,))
+        else:
+            jobs.append(job)
+        self.length += 1
 
     def put_always(self, job: Job) -> None:
         """Append a job although the queue may be full: for jobs of the bus itself, of which each node has at most one."""
@@ -58,29 +63,28 @@ class RequestQueue:
         for _ in range(len(by_node)):
             node = next(iter(by_node))
             jobs = by_node.pop(node)
-            job = self._first_wanted(jobs, now) if session is None else self._first_of_session(jobs, now, session)
+            job = None
+            while jobs:
+                job = jobs.popleft() if session is None else self._pop_of_session(jobs, session)
+                if job is None:
+                    break
+                self.length -= 1
+                if job.expires > now and not job.sink.done():
+                    break
+                _drop(job)
+                job = None
             if jobs:
                 by_node[node] = jobs  # at the end of the round
             if job is not None:
                 return job
         return None
 
-    def _first_wanted(self, jobs: deque[Job], now: float) -> Job | None:
-        while jobs:
-            job = jobs.popleft()
-            self.length -= 1
-            if job.expires > now and not job.sink.done():
+    @staticmethod
+    def _pop_of_session(jobs: deque[Job], session: object) -> Job | None:
+        for at, job in enumerate(jobs):
+            if job.session is session:
+                del jobs[at]
                 return job
-            _drop(job)
-        return None
-
-    def _first_of_session(self, jobs: deque[Job], now: float, session: object) -> Job | None:
-        for job in [job for job in jobs if job.session is session]:
-            jobs.remove(job)
-            self.length -= 1
-            if job.expires > now and not job.sink.done():
-                return job
-            _drop(job)
         return None
 
     def expire(self, now: float) -> None:

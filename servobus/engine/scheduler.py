@@ -99,6 +99,23 @@ class Scheduler:
             raise overloaded(len(self._parked))
         self._park([job], now + node.reply_allowance_s)
 
+    def begins_at_once(self, job: Job, now: float) -> bool:
+        """Return whether the job can skip the queue, because nothing else waits and it would be taken next; it counts as taken
+        then."""
+        node = self.nodes.by_id.get(job.node)
+        if (
+            self.requests.length
+            or self._stops
+            or self._estops
+            or self.session is not None
+            or now >= self._parked_until
+            or (node is not None and node.health is OFFLINE)
+            or not self._only_requests(now)
+        ):
+            return False
+        self._served(REQUESTS, job)
+        return True
+
     def queue_own(self, job: Job) -> None:
         """Queue a job of the bus itself, of which each node has at most one. Never refused."""
         self.requests.put_always(job)
@@ -157,10 +174,11 @@ class Scheduler:
         if self._only_requests(now):
             # Nearly always, where callers ask as fast as they can: decided without asking each class.
             job = self.requests.take(now) if self.requests.length else None
-            if job is not None:
-                return self._served(REQUESTS, job)
-            self._owed = [False] * CLASSES
-            return None
+            if job is None:
+                self._owed = [False] * CLASSES
+            else:  # as `_served` does
+                self._owed[GOALS], self._owed[REQUESTS] = False, True
+            return job
         return self._fair_job(now)
 
     def _only_requests(self, now: float) -> bool:
@@ -191,6 +209,20 @@ class Scheduler:
             self._owed[above] = False
         self._owed[served] = True
         return job
+
+    def rest(self, now: float) -> float | None:
+        """End what is too old, and return when something becomes due; None: never. Called when nothing can be sent now."""
+        if (
+            self.requests.length
+            or self.coalescer.tickets
+            or self._parked
+            or self.ramps.active
+            or self.nodes.troubled
+            or self.session is not None
+        ):
+            self.expire(now)
+            return self.wake()
+        return None if self.polls.due == math.inf else self.polls.due
 
     def wake(self) -> float | None:
         """Return when something becomes due or too old, if nothing else happens; None: never."""

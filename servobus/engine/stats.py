@@ -42,28 +42,49 @@ class Counter(Described):
 
 
 class Histogram:
-    """Durations in buckets of logarithmic width, from a microsecond up; its size never grows."""
+    """Durations in buckets of logarithmic width, from a microsecond up; its size never grows.
 
-    __slots__ = ("_buckets", "count", "max", "total")
+    `add` is the append of a list, because every turn adds one; `fold` sorts the list into the buckets now and then.
+    """
+
+    __slots__ = ("_buckets", "_count", "_max", "_new", "_total", "add")
 
     def __init__(self) -> None:
-        self.count = 0
-        self.total = 0.0
-        self.max = 0.0
+        self._new: list[float] = []
+        self.add = self._new.append
+        """Add one duration in seconds; whoever adds many calls `fold` at times."""
+        self._count = 0
+        self._total = 0.0
+        self._max = 0.0
         self._buckets = [0] * (SUB_BUCKETS * 40)
 
-    def add(self, seconds: float) -> None:
-        self.count += 1
-        self.total += seconds
-        if seconds > self.max:
-            self.max = seconds
-        microseconds = int(seconds * 1e6)
-        if microseconds < SUB_BUCKETS:
-            self._buckets[max(microseconds, 0)] += 1
+    @property
+    def count(self) -> int:
+        self.fold()
+        return self._count
+
+    @property
+    def total(self) -> float:
+        """Seconds."""
+        self.fold()
+        return self._total
+
+    @property
+    def max(self) -> float:
+        """Seconds."""
+        self.fold()
+        return self._max
+
+    def fold(self) -> None:
+        """Sort the new durations into the buckets."""
+        if not self._new:
             return
-        shift = microseconds.bit_length() - 4
-        index = (shift + 1) * SUB_BUCKETS + (microseconds >> shift) - SUB_BUCKETS
-        self._buckets[min(index, len(self._buckets) - 1)] += 1
+        self._count += len(self._new)
+        self._total += sum(self._new)
+        self._max = max(self._max, *self._new)
+        for microseconds, count in Tally([int(seconds * 1e6) for seconds in self._new]).items():
+            self._buckets[_bucket(microseconds)] += count
+        self._new.clear()
 
     def percentile(self, share: float) -> float:
         """Return the seconds that `share` (0 to 1) of the durations do not exceed; 0 while there are none."""
@@ -77,11 +98,19 @@ class Histogram:
 
     def buckets(self) -> Iterator[tuple[float, int]]:
         """Upper bound in seconds and count of every bucket that is not empty, ascending."""
+        self.fold()
         for index, count in enumerate(self._buckets):
             if count:
                 shift, step = divmod(index, SUB_BUCKETS)
                 upper = index + 1 if shift == 0 else (SUB_BUCKETS + step + 1) << (shift - 1)
                 yield upper / 1e6, count
+
+
+def _bucket(microseconds: int) -> int:
+    if microseconds < SUB_BUCKETS:
+        return max(microseconds, 0)
+    shift = microseconds.bit_length() - 4
+    return min((shift + 1) * SUB_BUCKETS + (microseconds >> shift) - SUB_BUCKETS, SUB_BUCKETS * 40 - 1)
 
 
 NO_COUNTS: Mapping[Counter, int] = {}
@@ -93,7 +122,7 @@ class BusStats:
     __slots__ = ("busy", "counts", "started", "turns")
 
     def __init__(self, now: float) -> None:
-        self.counts: Tally[Counter] = Tally()
+        self.counts = dict.fromkeys(Counter, 0)
         self.turns = Histogram()
         self.busy = 0.0
         """Seconds of wire time, sent and received."""

@@ -53,7 +53,7 @@ class Turn(Transmit):
         self.echoes = 0
         self.skipped = -1
         """What the codec had skipped when the last frame was received; -1 before the first frame."""
-        self._torn: list[int] = []
+        self._torn: tuple[int, ...] = ()
         """Nodes whose reply was followed by bytes that are not a valid frame."""
 
     def offer(self, reply: Reply) -> bool:
@@ -71,7 +71,7 @@ class Turn(Transmit):
     def tear(self) -> None:
         """Give up the last reply: the bytes after it are not a valid frame."""
         if self.replies:
-            self._torn.append(self.replies.pop().node)
+            self._torn = (*self._torn, self.replies.pop().node)
 
     def complete(self) -> bool:
         return len(self.replies) == self.request.replies

@@ -120,7 +120,7 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
             self._send(data)
         else:
             self._deferred += data
-        if self.get_write_buffer_size() > MAX_UNSENT:
+        if (self._unsent or self._deferred) and self.get_write_buffer_size() > MAX_UNSENT:
             self._lose(OSError(errno.ENOBUFS, "it takes no more bytes"))
 
     def poll_input(self) -> bool:
@@ -150,7 +150,10 @@ class DirectTransport(SerialTransport):  # type: ignore[misc]  # pyserial-asynci
         self._busy_until += len(data) * 10 / self._rate
         if not self._unsent:
             try:
-                data = data[os.write(self._descriptor, data) :]
+                written = os.write(self._descriptor, data)
+                if written == len(data):
+                    return
+                data = data[written:]
             except (BlockingIOError, InterruptedError):
                 pass
             except OSError as error:

@@ -97,6 +97,13 @@ class Request(ABC, Generic[R]):
     def parse(self, replies: Sequence[Any]) -> R:
         """Return the value of the replies, which are in the order received. Raises DeviceError or EchoMismatch."""
 
+    def whole_reply(self, data: bytes) -> Any:
+        """Return the reply if these bytes are exactly the one reply that is due; None: the codec has to decide.
+
+        A short cut of the hot path. It must make the same checks as the codec and `answers`, and return the same reply.
+        """
+        return None
+
     def plain(self) -> Request[R] | None:
         """Return a request for the same value whose echo cannot be its reply; None: the echo of this one never can."""
         return None

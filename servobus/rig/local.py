@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import asdict
@@ -63,6 +64,9 @@ class LocalRig(Rig):
         """The buses and names that belong to the supervisors."""
         self.buses: dict[str, BusService] = {name: supervisor.bus for name, supervisor in self.supervisors.items()}
         self._names = {name: pair for name, pair in self.config.names.items() if pair[0] in self.supervisors}
+        bare = Counter(servo for _, servo in self._names.values())
+        unique = {servo: (bus, servo) for bus, servo in self._names.values() if bare[servo] == 1}
+        self._targets = {**unique, **self._names}
 
     @property
     def names(self) -> Mapping[str, tuple[str, str]]:
@@ -70,7 +74,7 @@ class LocalRig(Rig):
 
     def bus_of(self, name: str) -> tuple[BusService, str]:
         """The bus and the bare name of the servo `name`. Raises UnknownName."""
-        bus, servo = self._names.get(name) or self._names[self.full_name(name)]
+        bus, servo = self._targets.get(name) or self._names[self.full_name(name)]
         return self.buses[bus], servo
 
     # Lines
@@ -302,7 +306,7 @@ class LocalRig(Rig):
         results = await asyncio.gather(*(verb(*self.bus_of(name)) for name in full), return_exceptions=True)
         raise_failures(dict(zip(full, results, strict=True)))
 
-    def _event(self, name: str, **fields: Any) -> None:
+    def _event(self, name: EventName, **fields: Any) -> None:
         (log.info if name in QUIET else log.warning)(name, **fields)
         self.event_source.publish(Event(name, asyncio.get_running_loop().time(), fields))
 

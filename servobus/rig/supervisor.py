@@ -68,7 +68,7 @@ class BusSupervisor:
                 await self._serve(degraded)
 
     async def _serve(self, degraded: bool) -> None:
-        self.bus.line.traits = self.link.traits  # another port may have come back under this name
+        self.bus.line.use(self.link.traits)  # another port may have come back under this name
         try:
             await self.link.connect(self.bus.master)
         except LinkDown as error:
@@ -80,7 +80,7 @@ class BusSupervisor:
             await anyio.sleep(RETRY)
             return
         self.down = None
-        self.bus.line.traits = self.link.traits  # a tunnel knows its limits only now
+        self.bus.line.use(self.link.traits)  # a tunnel knows its limits only now
         self._event(EventName.LINE_UP, bus=self.name, port=self.link.address)
         await self.bus.start()
         self.tried.set()

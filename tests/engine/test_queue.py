@@ -126,6 +126,12 @@ def test_expire_fails_what_stands_first_and_is_too_old() -> None:
     assert (len(queue), queue.next_expiry()) == (0, None)
 
 
+def test_the_next_job_is_taken_after_all_of_one_node_expired() -> None:
+    queue = queue_of(job(1, expires=1.0), other := job(2, expires=9.0))
+    queue.expire(2.0)
+    assert drain(queue, 2.0) == [other]
+
+
 def test_a_plan_that_never_began_can_expire_too() -> None:
     def plan() -> Plan[None]:
         yield read(1)

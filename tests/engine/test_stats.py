@@ -62,15 +62,15 @@ def test_it_is_bounded_whatever_it_is_fed() -> None:
     assert made.percentile(1.0) < 1e12, "beyond the last bucket only `max` is exact"
 
 
-def test_a_snapshot_is_made_of_plain_numbers() -> None:
+def test_a_snapshot_is_made_of_plain_numbers_and_has_every_counter() -> None:
     stats = BusStats(10.0)
     stats.counts[Counter.TURNS] += 2
-    stats.counts[Counter.ECHOES] += 0
     stats.turns.add(0.002)
     stats.busy = 0.25
-    assert stats.snapshot(11.0) == {
-        "echoes": 0,
+    assert stats.snapshot(11.0, {Counter.DRAINS: 3}) == {
+        **{counter.value: 0 for counter in Counter},
         "turns": 2,
+        "drains": 3,
         "wire_load_percent": 25.0,
         "turn_ms": {"p50": 2.0, "p99": 2.0, "max": 2.0},
     }

@@ -44,18 +44,19 @@ ANSWERED_BROADCASTS = frozenset({Instruction.PING, Instruction.SYNC_READ})
 class Packet(NamedTuple):
     """One packet in either direction."""
 
-    id: int
-    code: int
+    node: int
+    status: int
     params: bytes
     frame: bytes
 
     @property
-    def node(self) -> int:
-        return self.id
+    def id(self) -> int:
+        return self.node
 
     @property
-    def status(self) -> int:
-        return self.code
+    def code(self) -> int:
+        """The instruction of a request, the health byte of a reply."""
+        return self.status
 
     @property
     def key(self) -> int:

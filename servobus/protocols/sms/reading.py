@@ -25,7 +25,8 @@ class Reader:
     def __init__(self, options: SmsBus, servos: Mapping[str, HostServo]) -> None:
         self.options = options
         self.servos = servos
-        self._registers: dict[tuple[str, str, bool], Request[Any]] = {}
+        self.registers: dict[tuple[str, str, bool], Request[Any]] = {}
+        """The reads that were made already, by servo, register and `raw`."""
         self._states = {name: _state_read(servo) for name, servo in servos.items()}
 
     def state(self, name: str) -> Request[dict[str, Update]]:
@@ -34,13 +35,13 @@ class Reader:
 
     def register(self, name: str, register: str, *, raw: bool) -> Request[Any]:
         """Return the read of a register, or of an ADDR:LEN. Raises UnknownName, NotSupported, LimitError."""
-        request = self._registers.get((name, register, raw))
+        request = self.registers.get((name, register, raw))
         if request is None:
             servo = self.servos[name]
             span = parse_span(register, table_size=TABLE_SIZE, max_count=MAX_READ, servo=name)
             if span is not None:
                 return Read(servo.node, *span, list)
-            request = self._registers[name, register, raw] = self._register_read(servo, register, raw=raw)
+            request = self.registers[name, register, raw] = self._register_read(servo, register, raw=raw)
         return request
 
     @staticmethod
@@ -49,7 +50,8 @@ class Reader:
         if raw:
             return servo.read_raw(register)
         convert = servo.converter(register)
-        return Read(servo.node, register.address, register.size, lambda data: convert(servo.decode(register, data)))
+        decode = servo.decoder(register)
+        return Read(servo.node, register.address, register.size, lambda data: convert(decode(data)))
 
     def polls(self, rates: Mapping[str, float]) -> list[Poll]:
         """Return the polls: SYNC READ for the servos that know it and share a block, one READ for each of the others."""

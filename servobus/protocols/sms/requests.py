@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from servobus.protocols.base import Request
-from servobus.protocols.sms.codec import BROADCAST_ID, OVERHEAD, Instruction, Packet, encode
+from servobus.protocols.sms.codec import BROADCAST_ID, HEADER, OVERHEAD, Instruction, Packet, encode
 
 R = TypeVar("R")
 
@@ -69,12 +69,18 @@ class PingById(SmsRequest[int | None]):
 class Read(SmsRequest[R]):
     """READ DATA (SMS 1.0, 1.3.2) of `size` bytes from `address`; `decode` turns them into the value."""
 
-    __slots__ = ("address", "decode")
+    __slots__ = ("_prefix", "address", "decode")
 
     def __init__(self, node: int, address: int, size: int, decode: Callable[[bytes], R]) -> None:
         super().__init__(node, Instruction.READ, bytes((address, size)), size=size)
         self.address = address
         self.decode = decode
+        self._prefix = HEADER + bytes((node, size + 2))
+
+    def whole_reply(self, data: bytes) -> Packet | None:
+        if len(data) != self.reply_size or data[:4] != self._prefix or ~sum(data[2:-1]) & 0xFF != data[-1]:
+            return None
+        return Packet(self.node, data[4], data[5:-1], data)
 
     def parse(self, replies: Sequence[Packet]) -> R:
         return self.decode(replies[0].params)
@@ -99,6 +105,9 @@ class Fence(Read[bytes]):
 
     def answers(self, reply: Packet) -> bool:
         return reply.id == self.node and len(reply.params) == self.reply_key and reply.params[0] == self.node
+
+    def whole_reply(self, data: bytes) -> None:
+        """Leave it to `answers`, which checks one byte more."""
 
 
 class Acknowledged(SmsRequest[int | None]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from struct import Struct
 from typing import Any
 
@@ -73,9 +74,13 @@ class HostServo:
         """Return the raw value in these bytes."""
         return register.decode(data, self.model.byte_order)
 
+    def decoder(self, register: Register) -> Callable[[bytes], int]:
+        """Return the function from the bytes of a register to its raw value."""
+        return partial(register.decode, byte_order=self.model.byte_order)
+
     def read_raw(self, register: Register) -> Read[int]:
         """Return the READ of a register's raw value."""
-        return Read(self.node, register.address, register.size, lambda data: self.decode(register, data))
+        return Read(self.node, register.address, register.size, self.decoder(register))
 
     def packer(self, registers: list[Register]) -> Callable[..., bytes]:
         """Return the function that packs one word for each of these registers, which follow one another."""
