@@ -42,7 +42,7 @@ class DuplexEngine(Engine):
 
     @property
     def idle(self) -> bool:
-        return self._job is None
+        return self.runner.job is None
 
     @property
     def takes_frames(self) -> bool:
@@ -72,11 +72,11 @@ class DuplexEngine(Engine):
     def _released(self) -> bool:
         """Return whether the last turn lets others follow: it is all that its job needs."""
         last = self._behind[-1] if self._behind else self._turn
-        return last is not None and self._job is not last.job
+        return last is not None and self.runner.job is not last.job
 
     def _following_request(self, now: float) -> Request[Any] | None:
-        job = self._current_job(now)
-        if job is None or not _single(job) or self._doubtful_node(job.request) is not None:
+        job = self.runner.current_job(now)
+        if job is None or not _single(job) or self.runner.doubtful_node(job.request) is not None:
             return None
         assert self._turn is not None
         if any(turn.request.node == job.request.node for turn in (self._turn, *self._behind)):
@@ -89,7 +89,7 @@ class DuplexEngine(Engine):
         else:
             self._behind.append(turn)
         if _single(turn.job):
-            self._job = None
+            self.runner.job = None
 
     def _end_turn(self, turn: Turn) -> None:
         self._turn = self._behind.pop(0) if self._behind else None

@@ -9,35 +9,30 @@ Before each frame the engine goes through these cases:
 1. A turn is under way: nothing is transmitted before its replies are here or its deadline has passed.
 2. The line must be silent for a while (it was opened, a reply is missing, bytes came unasked): wait. Only an e-stop is
    transmitted on a line that never falls silent; any plan under way fails then.
-3. An e-stop waits: a plan that moves something fails, any other plan is suspended and goes on afterwards. An e-stop
-   never interrupts an earlier one: a hold that goes on after a limp would switch the torque on again.
-4. The request could have a reply that is mistaken for a late one, because a node of it is doubtful: a fence comes first.
-   Requests without a reply need none, and the requests of a fence are not fenced themselves.
-5. Otherwise the request is transmitted. With no reply due, its value is there at once.
+3. The job that has the line gives its next request, or a fence before it: see `runner.py`. The request is transmitted;
+   with no reply due, its value is there at once.
 
 How a turn ends:
 
 1. Every reply was believed: the request has its value, or the error that the reply tells.
 2. Some replies of a group read are missing: those that came count, the silent nodes become doubtful.
 3. A reply is missing, or the window was rejected: the silent nodes become doubtful, and the line must fall silent. The
-   request is sent once more if it is idempotent, has tries left, belongs to no fence, its nodes are not offline and, where
-   it moves something, its time has not passed. A request retried alone lets the other nodes have their turns first.
+   runner sends the request once more, or gives it up.
 4. The line was lost: everything ends with LinkDown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from servobus.engine.health import OFFLINE, ONLINE, Node
-from servobus.engine.job import Done, Failed, Job, JobKind, NodeRestarted, Step
+from servobus.engine.job import Job, JobKind
 from servobus.engine.line import QUIET, Line
+from servobus.engine.runner import JobRunner
 from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats, Counter
 from servobus.engine.turn import Transmit, Turn, Window, judge
-from servobus.errors import EStopped, LinkDown, NotEnabled, ReplyTimeout, ServobusError
+from servobus.errors import LinkDown, ReplyTimeout
 from servobus.protocols.base import Codec, Reply, Request
 
 # Looking a member up in its enum is a Python call, and these are needed in every turn.
@@ -74,10 +69,7 @@ class Engine:
         self.up = False
         """The line is open."""
         self._codec = codec
-        self._job: Job | None = None
-        """The job that has the line: a plan, or the request under way."""
-        self._suspended: Job | None = None
-        """A plan that goes on after the e-stop."""
+        self.runner = JobRunner(bus, scheduler, scheduler.nodes, stats)
         self._turn: Turn | None = None
         """The oldest turn under way."""
         self._ended: Turn | None = None
@@ -99,7 +91,7 @@ class Engine:
     @property
     def idle(self) -> bool:
         """No job is under way and no turn is in flight, so a new job may begin at once."""
-        return self._job is None and self._turn is None
+        return self.runner.job is None and self._turn is None
 
     @property
     def takes_frames(self) -> bool:
@@ -118,14 +110,14 @@ class Engine:
         if not self.up:
             raise LinkDown("the line is down: it is opened again as soon as the port is back; retry then", bus=self.bus)
         if (
-            self._job is None
+            self.runner.job is None
             and self._turn is None
             and job.plan is None
-            and self._suspended is None
+            and self.runner.suspended is None
             and self.line.is_ready(now)
             and self.scheduler.begins_at_once(job, now)
         ):
-            self._job = job
+            self.runner.job = job
             return True
         self.scheduler.queue(job, now)
         return self.idle
@@ -136,11 +128,8 @@ class Engine:
         if not self.up:
             raise LinkDown("the line is down: nothing can be stopped through it", bus=self.bus)
         if job.kind is ESTOP:
-            self.scheduler.drop(self.estopped, motion_only=True)
+            self.scheduler.drop(self.runner.estopped, motion_only=True)
         self.scheduler.put_stop(job)
-
-    def estopped(self, servo: str) -> ServobusError:
-        return EStopped("the e-stop came first: nothing more was sent", bus=self.bus, servo=servo or None)
 
     # The line
 
@@ -158,8 +147,8 @@ class Engine:
         """End everything: the line is gone. `cause` is None where we closed it ourselves."""
         self.up = False
         self.deliver()
-        begun = [self._job, self._suspended, *self._drop_turns()]
-        self._job = self._suspended = None
+        begun = [self.runner.job, self.runner.suspended, *self._drop_turns()]
+        self.runner.job = self.runner.suspended = None
         self.nodes.suspect_all()
         self.stats.counts[Counter.LINE_LOST] += cause is not None
         reason = str(cause) if cause else "closed"
@@ -188,13 +177,13 @@ class Engine:
             return IDLE
         line = self.line
         if not line.is_ready(now):
-            ready = line.ready_at(now, estop_pending=self.estop_pending)
+            ready = line.ready_at(now, estop_pending=self.runner.estop_pending)
             if ready > now:
                 return self._wait_for_line(ready, now)
             if line.waiting_for_silence:
                 self._reset_codec()
                 line.end_wait()
-        request = self._next_request(now)
+        request = self.runner.next_request(now)
         if request is not None:
             return self._transmit(request, now)
         if self._ended is not None:
@@ -202,78 +191,17 @@ class Engine:
         when = self.scheduler.rest(now)
         return IDLE if when is None else WaitUntil(when)
 
-    @property
-    def estop_pending(self) -> bool:
-        """An e-stop waits or is under way: it is transmitted even on a line that never falls silent."""
-        return self.scheduler.estop_pending or (self._job is not None and self._job.kind is ESTOP)
-
     def _wait_for_line(self, ready: float, now: float) -> WaitUntil:
         self.deliver()
-        if self.line.babbling and self._job is not None and self._job.kind is not ESTOP:
-            job, self._job = self._job, None
+        if self.line.babbling and self.runner.job is not None and self.runner.job.kind is not ESTOP:
+            job, self.runner.job = self.runner.job, None
             message = "the line never falls silent: look for a second master or a servo that sends without being asked"
             job.fail(ReplyTimeout(message, bus=self.bus))
         self.scheduler.expire(now)
         return WaitUntil(ready)
 
-    def _next_request(self, now: float) -> Request[Any] | None:
-        """Return the next request of the job under way or of the next job, behind a fence where one is due."""
-        while (job := self._current_job(now)) is not None:
-            request = job.request
-            if not request.replies or job.fencing:
-                return request
-            doubtful = self._doubtful_node(request)
-            if doubtful is None:
-                return request
-            self.stats.counts[Counter.FENCES] += 1
-            self._apply(job, job.put_fence(self.scheduler.fence(doubtful)))
-        return None
-
-    def _current_job(self, now: float) -> Job | None:
-        """Return the job that has the line, begun if need be."""
-        job = self._job
-        if job is None:
-            if self._suspended is None:
-                job = self.scheduler.next_job(now)
-                if job is None or job.plan is None:  # nearly always
-                    self._job = job
-                    return job
-                self._begin(job)
-        elif job.kind is not ESTOP and self.scheduler.estop_pending:
-            self._make_way(job)
-        while self._job is None:
-            if self._suspended is not None and not self.scheduler.estop_pending:
-                self._job, self._suspended = self._suspended, None
-                return self._job
-            job = self.scheduler.next_job(now)
-            if job is None:
-                return None
-            self._begin(job)
-        return self._job
-
-    def _begin(self, job: Job) -> None:
-        self._job = job
-        if job.plan is not None:
-            self.stats.counts[Counter.FENCES] += job.kind is JobKind.PROBE
-            self._apply(job, job.begin())
-
-    def _make_way(self, job: Job) -> None:
-        self._job = None
-        if job.kind is JobKind.MOTION:
-            job.fail(self.estopped(""))
-        else:
-            self._suspended = job
-
-    def _doubtful_node(self, request: Request[Any]) -> Node | None:
-        by_id = self.nodes.by_id
-        for node_id in request.nodes:
-            node = by_id.get(node_id) or self.nodes.node(node_id)
-            if node.health is not ONLINE:
-                return node
-        return None
-
     def _transmit(self, request: Request[Any], now: float) -> Transmit:
-        job, line, counts = self._job, self.line, self.stats.counts
+        job, line, counts = self.runner.job, self.line, self.stats.counts
         assert job is not None
         frame, replies, byte_time = request.frame, request.replies, line.byte_time
         start = line.send(frame, now, 0.0 if replies else request.quiet_after)
@@ -285,7 +213,7 @@ class Engine:
             return Transmit(frame, None)
         reply_time = replies * request.reply_size * byte_time
         self.stats.busy += len(frame) * byte_time + reply_time
-        turn = Turn(request, job, start, line.sent_by, line.sent_by + reply_time + self._allowance(request))
+        turn = Turn(frame, line.sent_by + reply_time + self._allowance(request), request, job, start, line.sent_by)
         self._begin_turn(turn)
         return turn
 
@@ -399,13 +327,13 @@ class Engine:
             node.replied(reply.status, latency)
         job = turn.job
         if job.plan is None and not job.fencing:
-            if self._job is job:
-                self._job = None
+            if self.runner.job is job:
+                self.runner.job = None
             if self._ended is not None:
                 self.deliver()
             self._ended = turn
         else:
-            self._conclude(job, request, turn.replies)
+            self.runner.conclude(job, request, turn.replies)
 
     def _missed(self, turn: Turn, now: float) -> None:
         """A reply is missing, or the window cannot be believed."""
@@ -420,38 +348,12 @@ class Engine:
         if request.partial and turn.replies and not rejected:
             for reply in turn.replies:  # how soon they came is not known: the deadline ended this turn
                 self.nodes.node(reply.node).answered(reply.status)
-            self._conclude(turn.job, request, turn.replies)
+            self.runner.conclude(turn.job, request, turn.replies)
         else:
-            self._retry(turn, now)
+            self.runner.retry(turn, now)
 
     def _end_turn(self, turn: Turn) -> None:
         self._turn = None
-
-    def _retry(self, turn: Turn, now: float) -> None:
-        """Send the request once more, or give it up: case 3 above."""
-        job, request = turn.job, turn.request
-        job.attempts += 1
-        offline = any(self.nodes.node(node).health is OFFLINE for node in request.nodes)
-        too_late = job.kind is JobKind.MOTION and now >= job.expires
-        # The request of a fence is not repeated as it was: its reply may still come, and must be fenced again.
-        if not request.idempotent or job.fencing or too_late or job.attempts >= job.tries or offline:
-            self._apply(job, job.give_up(self._timeout(job.attempts, request), offline=offline))
-            return
-        self.stats.counts[Counter.RETRIES] += 1
-        job.request = (request.plain() if turn.echoes else None) or request
-        if job.plan is None:
-            if self._job is job:
-                self._job = None
-            self.scheduler.retry(job)
-
-    def _timeout(self, attempts: int, request: Request[Any]) -> ReplyTimeout:
-        tries = "1 try" if attempts == 1 else f"{attempts} tries"
-        return ReplyTimeout(
-            f"no answer after {tries}: is it powered, are id and baud rate right? What was asked may have been applied",
-            bus=self.bus,
-            request=request,
-            raw=request.frame,
-        )
 
     # Results
 
@@ -462,38 +364,7 @@ class Engine:
         """
         turn, self._ended = self._ended, None
         if turn is not None:
-            self._conclude(turn.job, turn.request, turn.replies)
+            self.runner.conclude(turn.job, turn.request, turn.replies)
         job, self._unanswered = self._unanswered, None
         if job is not None:
-            self._conclude(job, job.request, ())
-
-    def _conclude(self, job: Job, request: Request[Any], replies: Sequence[Reply]) -> None:
-        """Parse the replies of a turn, and go on with its job."""
-        try:
-            value = request.parse(replies)
-        except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its job, never the bus
-            self._apply(job, job.give_up(error))
-            return
-        if job.plan is None and not job.fencing:
-            if self._job is job:
-                self._job = None
-            if not job.sink.done():
-                job.sink.set_result(value)
-        else:
-            self._apply(job, job.advance(value))
-
-    def _apply(self, job: Job, step: Step) -> None:
-        """Keep the job on the line, or end it."""
-        error: Exception | None = None
-        if isinstance(step, NodeRestarted) and job.kind is JobKind.MOTION:
-            error = NotEnabled("the servo has restarted and is disabled: nothing was sent; enable it again")
-        elif isinstance(step, Failed):
-            error = step.error
-        elif not isinstance(step, Done):
-            return
-        if self._job is job:
-            self._job = None
-        if isinstance(step, Done):
-            job.succeed(step.value)
-        elif error is not None:
-            job.fail(error.at(bus=self.bus) if isinstance(error, ServobusError) else error)
+            self.runner.conclude(job, job.request, ())

@@ -13,6 +13,7 @@ A turn judges the window in which its replies are due:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
@@ -20,41 +21,34 @@ from servobus.engine.job import Job
 from servobus.protocols.base import Codec, Reply, Request
 
 
+@dataclass(slots=True, eq=False)
 class Transmit:
     """What the engine wants done now: put a frame on the line."""
 
-    __slots__ = ("deadline", "frame")
-
-    def __init__(self, frame: bytes, deadline: float | None) -> None:
-        self.frame = frame
-        self.deadline = deadline
-        """When the missing replies count as missed; None: no reply is due."""
+    frame: bytes
+    deadline: float | None
+    """When the missing replies count as missed; None: no reply is due."""
 
 
+@dataclass(slots=True, eq=False)
 class Turn(Transmit):
     """One request under way, and its job."""
 
-    __slots__ = ("_torn", "echoes", "extended", "job", "replies", "request", "sent_at", "sent_by", "skipped")
-
     deadline: float
-
-    def __init__(self, request: Request[Any], job: Job, sent_at: float, sent_by: float, deadline: float) -> None:
-        self.frame = request.frame
-        self.request = request
-        self.job = job
-        self.sent_at = sent_at
-        """When its first byte left."""
-        self.sent_by = sent_by
-        """When its last byte has left."""
-        self.deadline = deadline
-        self.extended = False
-        """Its deadline was moved already."""
-        self.replies: list[Any] = []
-        self.echoes = 0
-        self.skipped = -1
-        """What the codec had skipped when the last frame was received; -1 before the first frame."""
-        self._torn: tuple[int, ...] = ()
-        """Nodes whose reply was followed by bytes that are not a valid frame."""
+    request: Request[Any]
+    job: Job
+    sent_at: float
+    """When its first byte left."""
+    sent_by: float
+    """When its last byte has left."""
+    extended: bool = False
+    """Its deadline was moved already."""
+    replies: list[Any] = field(default_factory=list)
+    echoes: int = 0
+    skipped: int = -1
+    """What the codec had skipped when the last frame was received; -1 before the first frame."""
+    _torn: tuple[int, ...] = ()
+    """Nodes whose reply was followed by bytes that are not a valid frame."""
 
     def offer(self, reply: Reply) -> bool:
         """Take a valid frame. False: it is a stray."""

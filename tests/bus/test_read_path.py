@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+import pytest
+
 import servobus
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
@@ -23,12 +25,12 @@ MAX_CALLS, MAX_FILES = 60, 12
 
 @contextmanager
 def counted_calls() -> Iterator[list[tuple[str, str]]]:
-    """The Python functions of servobus that are called meanwhile, with their files; the link of the test is not counted."""
+    """The Python functions of servobus that are called meanwhile, with their files."""
     calls: list[tuple[str, str]] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:
         path = Path(frame.f_code.co_filename)
-        if event == "call" and path.is_relative_to(PACKAGE) and path.parent.name != "links":
+        if event == "call" and path.is_relative_to(PACKAGE):
             calls.append((str(path.relative_to(PACKAGE)), frame.f_code.co_name))
 
     sys.setprofile(note)
@@ -38,17 +40,18 @@ def counted_calls() -> Iterator[list[tuple[str, str]]]:
         sys.setprofile(None)
 
 
+@pytest.mark.parametrize(("raw", "value"), [(True, 0x234), (False, -130.4)])
 @virtual
-async def test_a_read_on_an_idle_bus_takes_few_calls_in_few_files() -> None:
+async def test_a_read_on_an_idle_bus_takes_few_calls_in_few_files(raw: bool, value: float) -> None:
     rig = LocalRig(config("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts}"), supervisors=None)  # type: ignore[arg-type]
     bus, puppet = rig.buses["arm"], Puppet()
     await MemoryLink(puppet, LineTraits(baudrate=1_000_000)).connect(bus.master)
     await bus.start()
     reply = [(0.001, encode(1, 0, b"\x34\x02"))]
     puppet.script = lambda frame: reply
-    await rig.read_register("s1", "present_position", raw=True)
+    await rig.read_register("s1", "present_position", raw=raw)
     with counted_calls() as calls:
-        assert await rig.read_register("s1", "present_position", raw=True) == 0x234
+        assert await rig.read_register("s1", "present_position", raw=raw) == pytest.approx(value, abs=0.1)
     await rig.close()
     listing = "\n".join(f"{file}: {function}" for file, function in calls)
     assert len(calls) <= MAX_CALLS, listing

@@ -61,13 +61,13 @@ def test_an_estop_comes_between_the_frames_of_a_plan_which_goes_on_afterwards() 
     rig = Rig()
     results = rig.submit(plan=three_reads(), node=1)
     assert rig.answer(1) == ask(10)
-    pending = [rig.engine.estop_pending]
+    pending = [rig.engine.runner.estop_pending]
     stopped = rig.estop(stop_plan(2))
-    pending.append(rig.engine.estop_pending)
+    pending.append(rig.engine.runner.estop_pending)
     assert rig.answer() == ask(100)
-    pending.append(rig.engine.estop_pending)
+    pending.append(rig.engine.runner.estop_pending)
     assert rig.answer() == ask(101)
-    pending.append(rig.engine.estop_pending)
+    pending.append(rig.engine.runner.estop_pending)
     assert (stopped, pending) == (["stopped"], [False, True, True, False]), "to its last frame"
     assert [rig.answer(2), rig.answer(3)] == [ask(11), ask(12)]
     assert results == [[1, 2, 3]]
@@ -123,7 +123,7 @@ def test_an_estop_may_come_while_a_fence_is_out_and_the_fence_goes_on() -> None:
 
 def test_an_estop_names_the_servo_where_there_is_one() -> None:
     rig = Rig()
-    assert str(rig.engine.estopped("elbow")).startswith("arm/elbow:")
+    assert str(rig.engine.runner.estopped("elbow")).startswith("arm/elbow:")
 
 
 # The line

@@ -15,7 +15,7 @@ class OneTurn:
 
     def __init__(self, request: ToyRequest) -> None:
         job = Job(Sink(), 1.0, request=request)
-        self.turn = Turn(request, job, sent_at=1.0, sent_by=1.1, deadline=2.0)
+        self.turn = Turn(request.frame, 2.0, request, job, sent_at=1.0, sent_by=1.1)
         self.codec = ToyCodec()
         self.strays: list[Reply] = []
 

@@ -47,11 +47,7 @@ class Reader:
     @staticmethod
     def _register_read(servo: HostServo, name: str, *, raw: bool) -> Read[Any]:
         register = servo.model.readable(name)
-        if raw:
-            return servo.read_raw(register)
-        convert = servo.converter(register)
-        decode = servo.decoder(register)
-        return Read(servo.node, register.address, register.size, lambda data: convert(decode(data)))
+        return servo.read_raw(register) if raw else servo.read_physical(register)
 
     def polls(self, rates: Mapping[str, float]) -> list[Poll]:
         """Return the polls: SYNC READ for the servos that know it and share a block, one READ for each of the others."""

@@ -8,9 +8,10 @@ cannot be a reply.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 from servobus.protocols.base import Request
+from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import BROADCAST_ID, HEADER, OVERHEAD, Instruction, Packet, encode
 
 R = TypeVar("R")
@@ -93,6 +94,40 @@ class Read(SmsRequest[R]):
         if self.address:
             return Read(self.node, self.address - 1, 3, lambda data: decode(data[1:]))
         return Read(self.node, 0, 3, lambda data: decode(data[:2]))
+
+
+class RegisterRead(Read[Any]):
+    """READ of one register as a number. Everything it takes is looked up once, because the same registers are read all the time.
+
+    `linear` (scale, zero, direction, unit per step) turns the raw value into the servo's unit, `convert` into any other physical
+    value; with neither, the value is the raw one.
+    """
+
+    __slots__ = ("_byte_order", "_convert", "_linear", "_sign_bit")
+
+    def __init__(
+        self,
+        node: int,
+        register: Register,
+        byte_order: Literal["little", "big"],
+        *,
+        linear: tuple[float, float, int, float] | None = None,
+        convert: Callable[[int], Any] | None = None,
+    ) -> None:
+        super().__init__(node, register.address, register.size, self._value)
+        self._byte_order: Literal["little", "big"] = byte_order
+        self._sign_bit = register.sign_bit
+        self._linear = linear
+        self._convert = convert
+
+    def _value(self, data: bytes) -> Any:
+        raw, sign_bit = int.from_bytes(data, self._byte_order), self._sign_bit
+        if sign_bit is not None and raw >> sign_bit & 1:
+            raw = -(raw & ((1 << sign_bit) - 1))
+        if self._linear is not None:
+            scale, zero, direction, unit_per_step = self._linear
+            return direction * (raw * scale - zero) * unit_per_step + 0.0
+        return raw if self._convert is None else self._convert(raw)
 
 
 class Fence(Read[bytes]):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from struct import Struct
 from typing import Any
 
@@ -12,7 +11,7 @@ from servobus.errors import LimitError
 from servobus.protocols.model import Register
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsServo
-from servobus.protocols.sms.requests import Read
+from servobus.protocols.sms.requests import Read, RegisterRead
 from servobus.values import GoalKind, Update, is_number
 
 STRUCT_CODES = {1: "B", 2: "H", 4: "I"}
@@ -74,13 +73,18 @@ class HostServo:
         """Return the raw value in these bytes."""
         return register.decode(data, self.model.byte_order)
 
-    def decoder(self, register: Register) -> Callable[[bytes], int]:
-        """Return the function from the bytes of a register to its raw value."""
-        return partial(register.decode, byte_order=self.model.byte_order)
-
     def read_raw(self, register: Register) -> Read[int]:
         """Return the READ of a register's raw value."""
-        return Read(self.node, register.address, register.size, self.decoder(register))
+        return RegisterRead(self.node, register, self.model.byte_order)
+
+    def read_physical(self, register: Register) -> Read[Any]:
+        """Return the READ of a register's physical value."""
+        calibration, order = self.calibration, self.model.byte_order
+        if register.unit not in ("position", "speed"):
+            return RegisterRead(self.node, register, order, convert=self.converter(register))
+        zero = calibration.zero if register.unit == "position" else 0.0
+        linear = (register.scale, zero, calibration.direction, calibration.unit_per_step)
+        return RegisterRead(self.node, register, order, linear=linear)
 
     def packer(self, registers: list[Register]) -> Callable[..., bytes]:
         """Return the function that packs one word for each of these registers, which follow one another."""
