@@ -245,9 +245,9 @@ class Identity:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ServoGoal:
-    """One goal of one servo, checked, on its way to the wire."""
+    """One goal of one servo, on its way to the wire. Only `packed` is set later, once the driver has checked the goal."""
 
     servo: str
     goal: Goal

@@ -11,34 +11,55 @@ from servobus.errors import LimitError
 from servobus.protocols.options import ServoOptions
 from servobus.values import GOAL_NUMBERS, Goal, is_number, no_number
 
+GOAL_DETAILS = GOAL_NUMBERS[1:]
+"""The numbers beside the value, which may be None."""
+
 
 def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:
     """The goal to send: the same, or clamped where the servo says so. `setpoint` is the last position asked for or seen.
     Raises LimitError."""
-    for field in GOAL_NUMBERS:
+    if not is_number(goal.value):
+        raise LimitError(no_number("value", goal.value), servo=name)
+    plain = goal.speed is goal.duration is goal.acceleration is goal.effort is goal.start_within is None
+    if not plain:
+        _check_details(name, goal)
+    if goal.kind == "velocity":
+        value = _within(name, "velocity", goal.value, _symmetric(options.max_speed), options)
+    else:
+        value = _position(name, goal.value, options, setpoint)
+    if value != goal.value:  # a copy of a goal costs as much as all these checks
+        goal = replace(goal, value=value)
+    return goal if plain or goal.kind == "velocity" else _limit_speed(name, goal, options, setpoint)
+
+
+def _check_details(name: str, goal: Goal) -> None:
+    """Check everything beside the value. Raises LimitError."""
+    for field in GOAL_DETAILS:
         value = getattr(goal, field)
-        if value is None and field != "value":
+        if value is None:
             continue
         if not is_number(value):
             raise LimitError(no_number(field, value), servo=name)
-        if field != "value" and (value < 0 or (value == 0 and field != "speed")):
+        if value < 0 or (value == 0 and field != "speed"):
             raise LimitError(f"{field}: {value:g} must be above 0", servo=name)
     if goal.speed is not None and goal.duration is not None:
         raise LimitError("give a speed or a duration, not both", servo=name)
     if goal.effort is not None and goal.effort > 100:
         raise LimitError(f"effort: {goal.effort:g} % is above 100 %", servo=name)
-    if goal.kind == "velocity":
-        return replace(goal, value=_within(name, "velocity", goal.value, _symmetric(options.max_speed), options))
-    goal = replace(goal, value=_position(name, goal.value, options, setpoint))
+
+
+def _limit_speed(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:
+    """Return the position goal with a speed, or a duration, that keeps to `max_speed`. Raises LimitError."""
     if goal.speed is not None:
-        goal = replace(goal, speed=_within(name, "speed", goal.speed, _symmetric(options.max_speed), options))
+        speed = _within(name, "speed", goal.speed, _symmetric(options.max_speed), options)
+        return goal if speed == goal.speed else replace(goal, speed=speed)
     if goal.duration is not None and options.max_speed is not None and setpoint is not None:
         fastest = abs(goal.value - setpoint) / options.max_speed
         if goal.duration < fastest:
             if options.on_limit == "reject":
                 reason = f"is too short for max_speed {options.max_speed:g}: give {fastest:.3g} s or more"
                 raise LimitError(f"duration: {goal.duration:g} s {reason}", servo=name)
-            goal = replace(goal, duration=fastest)
+            return replace(goal, duration=fastest)
     return goal
 
 

@@ -38,6 +38,8 @@ SESSION = "a scan or commissioning session has this bus: wait until it ends"
 SETTLE_PERIOD = 0.02
 TOLERANCE_STEPS = 10
 _batches = itertools.count(1)
+# Looking a member up in its enum is a Python call, and these are needed for every goal.
+GOALS, SUPERSEDED = Counter.GOALS, Outcome.SUPERSEDED
 
 
 class Motion:
@@ -75,60 +77,72 @@ class Motion:
 
     # Goals
 
-    def check(self, goals: Mapping[str, Goal]) -> dict[str, Goal]:
+    def check(self, goals: Mapping[str, Goal]) -> dict[str, ServoGoal]:
         """Return the goals to send, clamped where a servo says so. Raises what refuses any of them; nothing is sent."""
         self.refuse()
-        return {servo: self._check(self._parts.records[servo], goal) for servo, goal in goals.items()}
+        now = self._parts.clock()
+        return {servo: self._check(servo, goal, now) for servo, goal in goals.items()}
 
-    def _check(self, record: ServoRecord, goal: Goal) -> Goal:
+    def _check(self, servo: str, goal: Goal, now: float) -> ServoGoal:
         parts = self._parts
+        record = parts.records[servo]
         if not record.enabled:
-            raise NotEnabled("the servo is not enabled: enable it first", bus=parts.name, servo=record.name)
+            raise NotEnabled("the servo is not enabled: enable it first", bus=parts.name, servo=servo)
         try:
-            checked = check_goal(record.name, goal, record.options, record.reference())
-            parts.driver.check_goal(ServoGoal(record.name, checked, record.reference()))
+            limited = check_goal(servo, goal, record.options, record.reference())
+            checked = ServoGoal(servo, limited, record.start(now, FRESH))
+            checked.packed = parts.driver.check_goal(checked)
         except ServobusError as error:
             raise error.at(bus=parts.name) from None
-        if checked != goal:
+        if limited is not goal:
             parts.stats.counts[Counter.GOALS_CLAMPED] += 1
-            parts.emit(EventName.GOAL_CLAMPED, bus=parts.name, servo=record.name, asked=goal.value, applied=checked.value)
+            parts.emit(EventName.GOAL_CLAMPED, bus=parts.name, servo=servo, asked=goal.value, applied=limited.value)
         return checked
 
-    def put(self, goals: Mapping[str, Goal], *, together: bool, confirm: bool) -> dict[str, asyncio.Future[Outcome]]:
+    def put(self, goals: Mapping[str, ServoGoal], *, together: bool, confirm: bool) -> dict[str, asyncio.Future[Outcome]]:
         """Send checked goals; each future ends with its outcome or its error."""
-        parts = self._parts
-        batch = next(_batches) if together else None
-        futures = {}
-        for servo, goal in goals.items():
-            future: asyncio.Future[Outcome] = self._loop.create_future()
-            record = parts.records[servo]
-            ticket = self._ticket(record, goal, future)
-            ticket.batch, ticket.confirm, ticket.gone = batch, confirm, future.cancelled
-            parts.stats.counts[Counter.GOALS] += 1
-            speed = parts.driver.host_speed(ticket.goal)
-            start = record.setpoint if record.ramped else ticket.goal.start
-            record.ramped = speed is not None
-            parts.scheduler.put_goal(ticket, parts.clock(), speed=speed, start=start)
-            futures[servo] = future
-        if not parts.master.up:
-            parts.scheduler.drop_goals(lambda servo: LinkDown("the line is down: nothing was sent", bus=parts.name, servo=servo))
+        batch, now = next(_batches) if together else None, self._parts.clock()
+        futures = {servo: self._put(goal, now, batch, confirm) for servo, goal in goals.items()}
+        self._drop_if_down()
         return futures
 
-    def _ticket(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome]) -> Ticket:
+    def send(self, servo: str, goal: Goal, *, confirm: bool) -> asyncio.Future[Outcome]:
+        """Check one goal and send it; the future ends with its outcome or its error."""
+        self.refuse()
         now = self._parts.clock()
-        two_turns = 2 * (record.node.reply_allowance_s + self._parts.line.traits.latency)
-        start_within = goal.start_within or record.options.ttl or max(MIN_START_WITHIN, two_turns)
-        position = record.position(now, FRESH)
-        start = record.reference() if position is None else position
-        done = partial(self._ended, record, goal, future)
-        return Ticket(ServoGoal(record.name, goal, start), record.node.id, now + start_within, done)
+        future = self._put(self._check(servo, goal, now), now, None, confirm)
+        self._drop_if_down()
+        return future
+
+    def _put(self, goal: ServoGoal, now: float, batch: int | None, confirm: bool) -> asyncio.Future[Outcome]:
+        parts = self._parts
+        record = parts.records[goal.servo]
+        future: asyncio.Future[Outcome] = self._loop.create_future()
+        expires = now + (goal.goal.start_within or record.options.ttl or self._default_start_within(record))
+        done = partial(self._ended, record, goal.goal, future)
+        ticket = Ticket(goal, record.node.id, expires, done, batch, confirm, future.cancelled)
+        parts.stats.counts[GOALS] += 1
+        speed = parts.driver.host_speed(goal)
+        start = record.setpoint if record.ramped else goal.start
+        record.ramped = speed is not None
+        parts.scheduler.put_goal(ticket, now, speed=speed, start=start)
+        return future
+
+    def _default_start_within(self, record: ServoRecord) -> float:
+        two_turns: float = 2 * (record.node.reply_allowance_s + self._parts.line.traits.latency)
+        return two_turns if two_turns > MIN_START_WITHIN else MIN_START_WITHIN
+
+    def _drop_if_down(self) -> None:
+        parts = self._parts
+        if not parts.master.up:
+            parts.scheduler.drop_goals(lambda servo: LinkDown("the line is down: nothing was sent", bus=parts.name, servo=servo))
 
     def _ended(self, record: ServoRecord, goal: Goal, future: asyncio.Future[Outcome], result: Outcome | Exception) -> None:
         """A ticket has ended."""
         counts = self._parts.stats.counts
         if isinstance(result, Outcome):
             counts[OUTCOME_COUNTERS[result]] += 1
-            if result is not Outcome.SUPERSEDED and goal.kind == "position":
+            if result is not SUPERSEDED and goal.kind == "position":
                 record.goal = goal.value
                 if not record.ramped:
                     record.setpoint = goal.value
@@ -280,7 +294,7 @@ class Motion:
             if not record.enabled:
                 return StopReport("none", False, True, "the servo was disabled, or has restarted")
             assert options.park_pose is not None
-            goal = Goal("position", options.park_pose)
+            goal = ServoGoal(servo, Goal("position", options.park_pose), record.start(self._parts.clock(), FRESH))
             await self.put({servo: goal}, together=False, confirm=False)[servo]
             await self.settle(servo, tolerance=None, timeout=options.park_timeout, parking=True)
         except ServobusError as error:

@@ -73,6 +73,11 @@ class ServoRecord:
         """Return where a step is counted from: the last goal, else the last position read."""
         return self.goal if self.goal is not None else self._fields.get("position")
 
+    def start(self, now: float, max_age: float) -> float | None:
+        """Return where a motion starts: the last position read, if it is fresh enough, else the last goal."""
+        position = None if self.position_at is None or now - self.position_at > max_age else self._fields.get("position")
+        return self.reference() if position is None else position
+
     def state(self, now: float, faults: tuple[str, ...]) -> State:
         fields = dict(self._fields)
         status = fields.pop("status", None)

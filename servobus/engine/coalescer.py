@@ -86,7 +86,7 @@ class Coalescer:
             members = self._group_of(first, ready)
             if members:
                 for ticket in members:
-                    del self.tickets[ticket.servo]
+                    del self.tickets[ticket.goal.servo]
                 return Group(members, first.batch is not None, first.confirm)
         return None
 

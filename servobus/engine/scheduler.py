@@ -74,7 +74,7 @@ class Scheduler:
         self._on_restart = on_restart
         self._estops: deque[Job] = deque()
         self._stops: deque[Job] = deque()
-        self._goal_jobs: deque[tuple[Job, list[Ticket]]] = deque()
+        self._goal_jobs: deque[tuple[Job, Sequence[Ticket]]] = deque()
         self._parked: list[Job] = []
         """Jobs for offline nodes."""
         self._parked_until = math.inf
@@ -305,7 +305,7 @@ class Scheduler:
     def _next_goal(self, now: float) -> Job | None:
         for ticket in self.ramps.due(now):
             self.coalescer.put(ticket)
-        while self._goal_jobs or self._plan_goals(now):
+        while self._goal_jobs:
             job, tickets = self._goal_jobs.popleft()
             ready = self.nodes.reachable()
             if all(ticket.node in ready and ticket.expires > now and not ticket.gone() for ticket in tickets):
@@ -313,7 +313,11 @@ class Scheduler:
                 return job
             # A plan of a split group waited, and is too old now, or a servo of it missed a reply: it may have restarted.
             self._unplan(job, tickets)
-        return None
+        if not self._plan_goals(now):
+            return None
+        job, _ = self._goal_jobs.popleft()  # the coalescer has just checked its tickets
+        self.goal_turns += 1
+        return job
 
     def _unplan(self, job: Job, tickets: Sequence[Ticket]) -> None:
         """Take a plan back that has not begun; its goals wait again."""
@@ -368,17 +372,23 @@ def _ignore() -> None:
     pass
 
 
-def _goal_job(plan: GoalPlan, group: Group) -> tuple[Job, list[Ticket]]:
-    tickets = [ticket for ticket in group.tickets if ticket.servo in plan.servos]
-    expires = max(ticket.expires for ticket in tickets)
+def _goal_job(plan: GoalPlan, group: Group) -> tuple[Job, Sequence[Ticket]]:
+    tickets = group.tickets
+    if len(plan.servos) < len(tickets):
+        tickets = [ticket for ticket in tickets if ticket.servo in plan.servos]
+    expires = max([ticket.expires for ticket in tickets])
     sink = Callback(partial(_end_tickets, tickets))
     return Job(sink, expires, plan=plan.plan, node=tickets[0].node, kind=JobKind.MOTION), tickets
 
 
 def _end_tickets(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | Exception) -> None:
     """End the tickets of one plan, with a result for each or with one error for all."""
-    for ticket in tickets:
-        ticket.done(result[ticket.servo] if isinstance(result, dict) else result)
+    if isinstance(result, dict):
+        for ticket in tickets:
+            ticket.done(result[ticket.goal.servo])
+    else:
+        for ticket in tickets:
+            ticket.done(result)
 
 
 def _probed(node: Node, later: float, result: object) -> None:

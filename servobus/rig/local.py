@@ -148,19 +148,26 @@ class LocalRig(Rig):
     # Motion
 
     async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
-        parts: dict[BusService, dict[str, Goal]] = {}
+        parts: dict[str, dict[str, Goal]] = {}
         for name, goal in goals.items():
-            bus, servo = self.bus_of(name)
-            if servo in parts.setdefault(bus, {}):
+            bus, servo = self._names.get(name) or self._names[self.full_name(name)]
+            part = parts.get(bus)
+            if part is None:
+                part = parts[bus] = {}
+            elif servo in part:
                 raise InvalidRequest(f"{self.full_name(name)} is named twice: give it one goal; nothing was sent")
-            parts[bus][servo] = goal
-        checked = {bus: bus.motion.check(part) for bus, part in parts.items()}
+            part[servo] = goal
+        checked = {bus: self.buses[bus].motion.check(part) for bus, part in parts.items()}
         futures = {
-            f"{bus.name}/{servo}": future
+            f"{bus}/{servo}": future
             for bus, part in checked.items()
-            for servo, future in bus.motion.put(part, together=together, confirm=confirm).items()
+            for servo, future in self.buses[bus].motion.put(part, together=together, confirm=confirm).items()
         }
         return await outcomes(futures)
+
+    async def send(self, name: str, goal: Goal, *, confirm: bool = False) -> Outcome:
+        bus, servo = self.bus_of(name)
+        return await bus.motion.send(servo, goal, confirm=confirm)
 
     async def enable(self, *names: str) -> None:
         await self._each(names, lambda bus, servo: bus.motion.enable(servo))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from typing import Any
 
 import anyio
@@ -14,10 +14,28 @@ from servobus.values import Outcome
 
 async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
     """The outcomes of all, by name. Raises as `raise_failures`."""
-    results = await asyncio.gather(*futures.values(), return_exceptions=True)
-    named = dict(zip(futures, results, strict=True))
-    raise_failures(named)
-    return {name: result for name, result in named.items() if isinstance(result, Outcome)}
+    done: dict[str, Outcome] = {}
+    failures: dict[str, Exception] = {}
+    try:
+        # Goals of one frame end together, so this waits for the first of them and is woken up once.
+        for name, future in futures.items():
+            try:
+                done[name] = await future
+            except Exception as error:  # noqa: BLE001 - it is raised below, with those of the other servos
+                failures[name] = error
+    except asyncio.CancelledError:
+        _abandon(futures.values())
+        raise
+    if failures:
+        raise_failures({name: failures.get(name) or done[name] for name in futures})
+    return done
+
+
+def _abandon(futures: Iterable[asyncio.Future[Outcome]]) -> None:
+    """Cancel what has not ended; an error that nobody receives any more is not reported as forgotten."""
+    for future in futures:
+        if not future.cancel() and not future.cancelled():
+            future.exception()
 
 
 async def uncancelled(coroutine: Coroutine[Any, Any, None]) -> asyncio.CancelledError | None:

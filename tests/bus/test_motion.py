@@ -11,7 +11,7 @@ import pytest
 
 from servobus.errors import Busy, DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
-from servobus.values import Goal, Outcome
+from servobus.values import Goal, Outcome, ServoGoal
 from tests.engine.scripted_line import Answers, puppet_bus
 from tests.virtual_time import virtual
 
@@ -27,6 +27,15 @@ async def test_a_caller_who_leaves_takes_its_goal_along() -> None:
         await asyncio.sleep(0.1)
         assert puppet.heard == []
         assert len(bus.scheduler.coalescer) == 0
+
+
+@virtual
+async def test_a_checked_goal_brings_the_bytes_that_are_sent() -> None:
+    async with puppet_bus() as (bus, _, _, _):
+        bus.records["s1"].enabled = True
+        checked = bus.motion.check({"s1": Goal("position", 5)})["s1"]
+        assert checked.packed.is_for(checked)
+        assert await bus.motion.send("s1", checked.goal, confirm=False) is Outcome.ACKED
 
 
 def keeping() -> Callable[[bytes], Answers | None]:
@@ -146,7 +155,7 @@ async def test_disable_ends_a_goal_that_waits() -> None:
         puppet.script = lambda frame: [] if frame[2] == 1 else None
         with pytest.raises(ReplyTimeout):
             await bus.read_register("s1", "id")
-        future = bus.motion.put({"s1": Goal("position", 5)}, together=False, confirm=False)["s1"]
+        future = bus.motion.put({"s1": ServoGoal("s1", Goal("position", 5))}, together=False, confirm=False)["s1"]
         with pytest.raises(ReplyTimeout):
             await bus.motion.disable("s1")
         with pytest.raises(NotEnabled, match="arm/s1"):
@@ -160,7 +169,7 @@ async def test_a_goal_on_a_line_that_is_down_fails_at_once() -> None:
         link.unplug()
         await asyncio.sleep(0)
         with pytest.raises(LinkDown, match="arm/s1"):
-            await bus.motion.put({"s1": Goal("position", 5)}, together=False, confirm=False)["s1"]
+            await bus.motion.put({"s1": ServoGoal("s1", Goal("position", 5))}, together=False, confirm=False)["s1"]
 
 
 @virtual

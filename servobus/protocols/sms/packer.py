@@ -63,6 +63,8 @@ class GoalPacker:
         self.rest_time = sentinel.value if sentinel.name == servo.time.name else 0
         """Raw time while the speed rules: 0, or the sentinel where this register is the sentinel."""
         self._position, self._time, self._speed = map(servo.word_maker, (servo.position, servo.time, servo.speed))
+        self._usual: tuple[Layout, int, int] | None = None
+        """Layout, time and speed of a plain position goal; made for the first one."""
         self._layouts: dict[tuple[GoalKind, tuple[str, ...]], Layout] = {}
         self._missing: Mapping[str, int] = {}
         """Settings that a plain goal must bring, while the servo holds `_missing_for`."""
@@ -70,26 +72,42 @@ class GoalPacker:
 
     def pack(self, goal: ServoGoal, settings: Mapping[str, int] | None = None) -> PackedGoal:
         """Return the goal as bytes, with these settings; None: with those that the servo does not hold."""
-        servo = self.servo
-        if goal.goal.kind != servo.fit.mode:
-            raise NotSupported(self._wrong_mode(goal.goal.kind), servo=servo.name)
+        servo, wanted = self.servo, goal.goal
+        mode = servo.fit.mode
+        if wanted.kind != mode:
+            raise NotSupported(self._wrong_mode(wanted.kind), servo=servo.name)
         if settings is None:
-            settings = self.missing_settings(goal.goal)
+            settings = self.missing_settings(wanted)
+        if settings or mode != "position" or wanted.speed is not None or wanted.duration is not None:
+            address, data = self._pack_all(goal, settings)
+        else:
+            address, data = self._pack_position(servo.calibration.to_raw(wanted.value))
+        return PackedGoal(servo, address, data, settings, wanted, goal.start, servo.fit, servo.held)
+
+    def _pack_position(self, raw: int) -> tuple[int, bytes]:
+        """Return address and bytes of a position alone, at the servo's usual speed: nearly every goal is one."""
+        position = self._position(raw)
+        if self._usual is None:
+            self._usual = self._layout(()), self._time(self.rest_time), self._speed(self.default_speed)
+        layout, time, speed = self._usual
+        return layout.address, layout.pack(position, time, speed)
+
+    def _pack_all(self, goal: ServoGoal, settings: Mapping[str, int]) -> tuple[int, bytes]:
+        """Return address and bytes of any goal with these settings."""
+        servo = self.servo
         layout = self._layout(tuple(settings))
         values = self._position_values(goal) if servo.fit.mode == "position" else self._velocity_values(goal.goal)
         if settings:
             before, after = (self._setting_values(names, settings) for names in (layout.before, layout.after))
             values = (*before, *values, *after)
-        data = layout.pack(*values)
-        return PackedGoal(servo, layout.address, data, settings, goal.goal, goal.start, servo.fit, servo.held)
+        return layout.address, layout.pack(*values)
 
     def first_goal(self, present: int) -> tuple[int, bytes]:
         """Return address and bytes of the goal that enable() writes: the present raw position, or speed 0 in wheel mode."""
+        if self.servo.fit.mode == "position":
+            return self._pack_position(present)
         layout = self._layout(())
-        if self.servo.fit.mode == "velocity":
-            return layout.address, layout.pack(0)
-        values = self._position(present), self._time(self.rest_time), self._speed(self.default_speed)
-        return layout.address, layout.pack(*values)
+        return layout.address, layout.pack(0)
 
     # Settings beside the goal
 
