@@ -137,7 +137,7 @@ def test_a_wheel_turns_both_ways_no_faster_than_its_limit_and_knows_no_positions
         check(Goal("velocity", -181.0), max_speed=180)
 
 
-def test_a_duration_that_needs_exactly_the_greatest_speed_passes() -> None:
+def test_a_duration_that_needs_exactly_the_max_speed_passes() -> None:
     assert check(at(90.0, duration=0.5), max_speed=180).duration == 0.5
     with pytest.raises(LimitError, match=r"duration: 0.4 s is too short for max_speed 180: give 0.5 s or more"):
         check(at(90.0, duration=0.4), max_speed=180)
@@ -148,6 +148,6 @@ def test_a_duration_counts_the_way_that_is_left_after_clamping() -> None:
     assert check(at(360.0, duration=0.5), max_speed=180, limits=[-90, 90], on_limit="clamp") == at(90, duration=0.5)
 
 
-def test_a_duration_is_not_judged_without_a_start_or_a_greatest_speed() -> None:
+def test_a_duration_is_not_checked_without_a_start_or_a_max_speed() -> None:
     assert check(at(90.0, duration=0.001), None, max_speed=180).duration == 0.001
     assert check(at(90.0, duration=0.001)).duration == 0.001

@@ -29,7 +29,7 @@ def reply(node: int, value: int, size: int = 2) -> bytes:
 def once(frame: bytes, answers: Answers) -> Callable[[bytes], Answers | None]:
     """These answers to the first such frame, the usual ones to all else."""
     left = [answers]
-    return lambda heard: left.pop() if heard == frame and left else None
+    return lambda request: left.pop() if request == frame and left else None
 
 
 POSITION = read_of(1, 56)
@@ -38,12 +38,12 @@ POSITION = read_of(1, 56)
 @virtual
 async def test_one_turn_at_a_time() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
-        open_turns, most = 0, 0
+        open_turns, max_open = 0, 0
 
         def script(frame: bytes) -> Answers | None:
-            nonlocal open_turns, most
+            nonlocal open_turns, max_open
             open_turns += 1
-            most = max(most, open_turns)
+            max_open = max(max_open, open_turns)
 
             def ended() -> None:
                 nonlocal open_turns
@@ -54,7 +54,7 @@ async def test_one_turn_at_a_time() -> None:
 
         puppet.script = script
         await asyncio.gather(*(bus.read_register(servo, "present_position") for servo in ("s1", "s2") for _ in range(5)))
-        assert most == 1
+        assert max_open == 1
 
 
 @virtual
@@ -63,8 +63,8 @@ async def test_a_late_reply_is_never_taken_for_the_next_one() -> None:
         puppet.script = once(POSITION, [(0.010, reply(1, 111))])
         value = await bus.read_register("s1", "present_position", raw=True)
         assert value == 0, "the late 111 was dropped, the retry's answer was taken"
-        assert puppet.heard[0] == POSITION
-        assert puppet.heard[1][5] == FENCE, "a fence went before the retry"
+        assert puppet.frames[0] == POSITION
+        assert puppet.frames[1][5] == FENCE, "a fence went before the retry"
         assert bus.stats.counts[Counter.TIMEOUTS] == 1
 
 
@@ -95,11 +95,11 @@ async def test_bytes_nobody_asked_for_are_listened_out() -> None:
         assert await bus.read_register("s2", "present_position", raw=True) == 0
         assert bus.clock() - started >= 0.002
         assert bus.stats.counts[Counter.UNSOLICITED_BYTES] == 8
-        assert any(frame[2] == 1 and frame[5] == FENCE for frame in puppet.heard), "the one who spoke was asked who it is"
+        assert any(frame[2] == 1 and frame[5] == FENCE for frame in puppet.frames), "the one who spoke was asked who it is"
 
 
 @virtual
-async def test_what_is_heard_before_the_question_has_left_is_no_answer() -> None:
+async def test_bytes_before_the_request_has_left_are_not_its_reply() -> None:
     paced = LineTraits(baudrate=200_000, paced=True)  # the question takes 0.4 ms
     async with puppet_bus(traits=paced) as (bus, puppet, _, _):
         puppet.script = once(POSITION, [(0.0003, reply(1, 9)), (0.002, reply(1, 8))])
@@ -107,16 +107,16 @@ async def test_what_is_heard_before_the_question_has_left_is_no_answer() -> None
 
 
 @virtual
-async def test_the_request_heard_back_is_never_its_own_answer() -> None:
+async def test_the_echo_of_a_request_is_never_its_reply() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = lambda frame: [(0.0005, frame)] if frame == POSITION else None
         assert await bus.read_register("s1", "present_position", raw=True) == 0
-        assert read_of(1, 55, 3) in puppet.heard, "asked again so that its echo cannot be an answer"
+        assert read_of(1, 55, 3) in puppet.frames, "asked again so that its echo cannot be an answer"
 
 
-@pytest.mark.parametrize(("echoes", "found"), [(True, "on"), (False, "off")])
+@pytest.mark.parametrize(("echoes", "reported"), [(True, "on"), (False, "off")])
 @virtual
-async def test_auto_hears_whether_the_line_echoes(echoes: bool, found: str) -> None:
+async def test_auto_finds_out_whether_the_line_echoes(echoes: bool, reported: str) -> None:
     async with puppet_bus(echo="auto", started=False) as (bus, puppet, _, _):
 
         def script(frame: bytes) -> Answers | None:
@@ -153,12 +153,12 @@ async def test_a_node_that_never_stops_talking_holds_back_all_but_an_e_stop() ->
 
         babble()
         await asyncio.sleep(0.1)
-        puppet.heard.clear()
+        puppet.frames.clear()
         waiting = asyncio.create_task(bus.read_register("s1", "present_position", raw=True))
         stopping = asyncio.create_task(bus.motion.stop())
         await asyncio.sleep(0.5)
-        assert puppet.heard, "the e-stop was said"
-        assert all(frame[4] != Instruction.READ or frame[5] != 56 for frame in puppet.heard[:1])
+        assert puppet.frames, "the e-stop was sent"
+        assert all(frame[4] != Instruction.READ or frame[5] != 56 for frame in puppet.frames[:1])
         talking = False
         await stopping
         assert await waiting == 0
@@ -169,8 +169,8 @@ async def test_an_e_stop_goes_between_the_frames_of_a_plan() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         enabling = asyncio.create_task(bus.motion.enable("s1"))
         await asyncio.sleep(0.0015)
-        said = len(puppet.heard)
-        assert said > 0
+        sent = len(puppet.frames)
+        assert sent > 0
         await bus.motion.stop()
         with pytest.raises(Exception, match="e-stop"):
             await enabling
@@ -196,7 +196,7 @@ async def test_a_cancelled_caller_tears_no_turn() -> None:
         with pytest.raises(asyncio.CancelledError):
             await first
         assert await second == 0
-        assert [frame for frame in puppet.heard if frame[2] == 1] == [POSITION]
+        assert [frame for frame in puppet.frames if frame[2] == 1] == [POSITION]
         assert bus.stats.counts[Counter.TIMEOUTS] == 0
 
 
@@ -210,7 +210,7 @@ async def test_a_caller_cancelled_before_its_turn_costs_no_frame() -> None:
         second.cancel()
         assert await first == 0
         await asyncio.sleep(0.1)
-        assert [frame for frame in puppet.heard if frame[2] == 2] == []
+        assert [frame for frame in puppet.frames if frame[2] == 2] == []
 
 
 @virtual
@@ -229,21 +229,21 @@ async def test_what_arrived_and_was_not_read_yet_is_not_late() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         transport = bus.master._transport
         assert transport is not None
-        looked = []
+        polls = []
 
-        class Looking:
-            """The transport, with bytes that are found only by looking."""
+        class Polled:
+            """The transport, with bytes that only a poll brings."""
 
             def __getattr__(self, name: str) -> object:
                 return getattr(transport, name)
 
             def poll_input(self) -> bool:
-                looked.append(bus.clock())
+                polls.append(bus.clock())
                 puppet.say(reply(1, 42))
                 return True
 
-        bus.master._transport = Looking()  # type: ignore[assignment]
+        bus.master._transport = Polled()  # type: ignore[assignment]
         puppet.script = once(POSITION, [])
         assert await bus.read_register("s1", "present_position", raw=True) == 42
-        assert len(looked) == 1
+        assert len(polls) == 1
         assert bus.stats.counts[Counter.TIMEOUTS] == 0

@@ -25,7 +25,7 @@ async def test_a_caller_who_leaves_takes_its_goal_along() -> None:
         futures = bus.motion.put(bus.motion.check({"s1": Goal("position", 5)}), together=False, confirm=False)
         futures["s1"].cancel()
         await asyncio.sleep(0.1)
-        assert puppet.heard == []
+        assert puppet.frames == []
         assert len(bus.scheduler.coalescer) == 0
 
 
@@ -53,14 +53,14 @@ def keeping() -> Callable[[bytes], Answers | None]:
 
 
 @virtual
-async def test_enable_asks_who_it_is_first_if_that_is_not_known() -> None:
+async def test_enable_identifies_the_servo_first() -> None:
     async with puppet_bus(started=False) as (bus, puppet, _, _):
         puppet.script = keeping()
         await bus.motion.enable("s1")
         assert bus.records["s1"].enabled
         identity = bus.records["s1"].identity
         assert identity is not None
-        assert puppet.heard[1][4:6] == bytes((Instruction.READ, 0)), "behind the fence comes the question who it is"
+        assert puppet.frames[1][4:6] == bytes((Instruction.READ, 0)), "behind the fence comes the question who it is"
 
 
 @virtual
@@ -102,15 +102,15 @@ async def test_disable_that_does_not_read_back_is_an_error_and_it_is_disabled_fo
 @virtual
 async def test_disable_is_refused_in_an_exclusive_session() -> None:
     async with puppet_bus() as (bus, puppet, _, _), bus.exclusive():
-        puppet.heard.clear()
+        puppet.frames.clear()
         with pytest.raises(Busy, match="arm/s1"):
             await bus.motion.disable("s1")
-        assert puppet.heard == []
+        assert puppet.frames == []
 
 
 @virtual
 @pytest.mark.parametrize("how", ["disabled", "restarted"])
-async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
+async def test_settle_fails_when_the_servo_is_disabled_or_restarts(how: str) -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = keeping()
         await bus.motion.enable("s1")
@@ -128,7 +128,7 @@ async def test_who_waits_for_a_servo_that_is_disabled_is_told(how: str) -> None:
 
 
 @virtual
-async def test_a_stop_while_its_place_is_read_is_not_taken_for_its_goal() -> None:
+async def test_a_stop_while_the_position_is_read_is_not_taken_for_arrival() -> None:
     """The hold puts the setpoint where it stands; a read that was under way then would find it there."""
     async with puppet_bus() as (bus, puppet, _, _):
         keep, asked = keeping(), asyncio.Event()
@@ -181,11 +181,11 @@ async def test_the_e_stop_ends_an_enable_under_way() -> None:
         with pytest.raises(EStopped):
             await enabling
         assert not bus.records["s1"].enabled
-        assert not any(frame[4] == Instruction.WRITE and frame[5] == 40 and frame[6] == 1 for frame in puppet.heard)
+        assert not any(frame[4] == Instruction.WRITE and frame[5] == 40 and frame[6] == 1 for frame in puppet.frames)
 
 
 @virtual
-async def test_a_servo_that_does_not_reach_its_park_pose_goes_limp_all_the_same() -> None:
+async def test_a_servo_that_does_not_arrive_at_its_park_pose_goes_limp() -> None:
     async with puppet_bus(PARKED) as (bus, puppet, _, _):
         puppet.script = keeping()
         await bus.motion.enable("s1")
@@ -193,7 +193,7 @@ async def test_a_servo_that_does_not_reach_its_park_pose_goes_limp_all_the_same(
         assert (report.action, report.written, report.confirmed) == ("park", True, False)
         assert "park pose" in report.detail
         assert not bus.records["s1"].enabled
-        assert any(frame[4] == Instruction.SYNC_WRITE and frame[5] == 40 for frame in puppet.heard)
+        assert any(frame[4] == Instruction.SYNC_WRITE and frame[5] == 40 for frame in puppet.frames)
 
 
 @virtual
@@ -201,7 +201,7 @@ async def test_a_bus_without_servos_stops_too() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         bus.records.clear()
         assert await bus.motion.stop() == {}
-        assert puppet.heard == []
+        assert puppet.frames == []
 
 
 @virtual
@@ -212,5 +212,5 @@ async def test_one_outcome_for_each_goal_of_a_frame() -> None:
         goals = bus.motion.check({"s1": Goal("position", 5), "s2": Goal("position", -5)})
         futures = bus.motion.put(goals, together=True, confirm=False)
         assert await asyncio.gather(*futures.values()) == [Outcome.SENT, Outcome.SENT]
-        assert len(puppet.heard) == 1
+        assert len(puppet.frames) == 1
         assert bus.records["s1"].setpoint == bus.records["s1"].goal == 5

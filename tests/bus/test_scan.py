@@ -23,7 +23,7 @@ async def test_every_id_at_every_rate() -> None:
         assert [step[:2] for step in steps] == [(asked, 16) for asked in range(1, 17)]
         hits = [step[2] for step in steps if step[2] is not None]
         assert [(hit[0], hit[1]) for hit in hits] == [(1, 1_000_000), (5, 1_000_000), (1, 500_000), (5, 500_000)]
-        pinged = [frame[2] for frame in puppet.heard if frame[4] == Instruction.PING]
+        pinged = [frame[2] for frame in puppet.frames if frame[4] == Instruction.PING]
         assert set(pinged) == set(range(8))
         assert bus.scheduler.session is None
 
@@ -41,7 +41,7 @@ async def test_a_scan_that_is_left_gives_the_line_back_at_its_own_rate() -> None
 
 
 @virtual
-async def test_a_servo_that_answers_only_ping_is_found_without_a_name() -> None:
+async def test_a_servo_that_answers_only_ping_is_a_hit_without_a_name() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         puppet.script = lambda frame: None if frame[4] == Instruction.PING and frame[2] == 9 else []
         hits = [hit async for _, _, hit in scan(bus, [bus.options.baudrate], [9]) if hit]
@@ -63,7 +63,7 @@ async def test_an_answer_that_looks_like_the_question_is_asked_for_in_another_wa
         puppet.script = script
         hits = [hit async for _, _, hit in scan(bus, [bus.options.baudrate], [9]) if hit]
         assert [hit[0] for hit in hits] == ([9] if there else [])
-        assert [frame[4] for frame in puppet.heard[:2]] == [Instruction.PING, Instruction.READ]
+        assert [frame[4] for frame in puppet.frames[:2]] == [Instruction.PING, Instruction.READ]
 
 
 @virtual

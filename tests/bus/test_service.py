@@ -51,15 +51,15 @@ async def test_one_that_answers_but_not_who_it_is_is_not_asked_all_the_time() ->
         version = encode(2, Instruction.READ, bytes((0, 5)))
         puppet.script = lambda frame: [] if frame == version else None
         await bus.start()
-        puppet.heard.clear()
+        puppet.frames.clear()
         for _ in range(100):
             puppet.say(encode(2, 0))  # it speaks unasked, so it becomes doubtful, and online again
             await asyncio.sleep(0.1)
-        assert 0 < puppet.heard.count(version) <= 3 * 10
+        assert 0 < puppet.frames.count(version) <= 3 * 10
 
 
 @virtual
-async def test_notes_of_an_identity_are_told_once() -> None:
+async def test_notes_of_an_identity_are_reported_once() -> None:
     async with puppet_bus() as (bus, _, _, events):
         first = events.count("servo_note")
         assert first > 0, "a puppet says model number 0 and response level 0"
@@ -71,21 +71,21 @@ async def test_notes_of_an_identity_are_told_once() -> None:
 async def test_an_exclusive_session_has_the_line_alone() -> None:
     async with puppet_bus(poll="{feedback: 50}") as (bus, puppet, _, _):
         async with bus.exclusive() as session:
-            puppet.heard.clear()
+            puppet.frames.clear()
             waiting = asyncio.create_task(bus.read_register("s1", "present_position", raw=True))
             with pytest.raises(Busy, match="session"):
                 await bus.motion.enable("s1")
             await asyncio.sleep(0.2)
-            assert puppet.heard == []
+            assert puppet.frames == []
             assert await bus.ask(bus.driver.ping(2), session=session) == 0
-            assert len(puppet.heard) == 1
+            assert len(puppet.frames) == 1
             assert not waiting.done()
             with pytest.raises(Busy):
                 async with bus.exclusive():
                     raise AssertionError
         assert await waiting == 0
         await asyncio.sleep(0.1)
-        assert len(puppet.heard) > 3, "polls go on"
+        assert len(puppet.frames) > 3, "polls go on"
 
 
 @virtual
@@ -109,10 +109,10 @@ async def test_no_session_while_the_e_stop_holds_or_something_is_enabled() -> No
 async def test_eeprom_of_an_enabled_servo_is_not_written() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         bus.records["s1"].enabled = True
-        puppet.heard.clear()
+        puppet.frames.clear()
         with pytest.raises(NotSupported, match="arm/s1"):
             await bus.write_register("s1", "return_delay", 1, raw=True, persist=True)
-        assert puppet.heard == []
+        assert puppet.frames == []
 
 
 @virtual
@@ -123,10 +123,10 @@ async def test_ping_looks_even_for_one_that_is_offline() -> None:
             await bus.read_register("s1", "id")
         await asyncio.sleep(10)
         assert bus.state("s1").health == "offline"
-        puppet.heard.clear()
+        puppet.frames.clear()
         with pytest.raises(ReplyTimeout):
             await bus.ping("s1")
-        assert puppet.heard
+        assert puppet.frames
         puppet.script = lambda frame: None
         assert await bus.ping("s1") == 0
         assert bus.state("s1").health == "online"

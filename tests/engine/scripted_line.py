@@ -23,7 +23,7 @@ class Puppet:
     def __init__(self) -> None:
         self.script: Callable[[bytes], Answers | None] = lambda frame: None
         """None: as usual."""
-        self.heard: list[bytes] = []
+        self.frames: list[bytes] = []
         self.baudrates: list[int] = []
         self._loop = asyncio.get_running_loop()
         self._deliver: Callable[[bytes], object] = bytes
@@ -34,9 +34,9 @@ class Puppet:
         self._deliver = deliver
 
     def receive(self, data: bytes) -> None:
-        self.heard.append(data)
-        found = self.script(data)
-        for delay, answer in self.usual(data) if found is None else found:
+        self.frames.append(data)
+        script = self.script(data)
+        for delay, answer in self.usual(data) if script is None else script:
             due = max(self._loop.time() + delay, self._until.get(data[2], 0.0))
             self._until[data[2]] = due
             self._loop.call_at(due, self._deliver, answer)
@@ -73,16 +73,16 @@ class Events(list[str]):
 async def puppet_bus(
     *servos: str, traits: LineTraits | None = None, started: bool = True, **keys: str
 ) -> AsyncIterator[tuple[BusService, Puppet, MemoryLink, Events]]:
-    """A bus of two STS, introduced unless `started` is False."""
+    """A bus of two STS, identified unless `started` is False."""
     setup = config(*(servos or ("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts}")), **keys)
     options, models = setup.buses["arm"], setup.models["arm"]
-    puppet, events, entry = Puppet(), Events(), PROTOCOLS["sms"]
+    puppet, events, protocol = Puppet(), Events(), PROTOCOLS["sms"]
     link = MemoryLink(puppet, traits or LineTraits(can_change_baud=True))
-    bus = BusService("arm", options, entry.driver(options, models), entry.codec(options), link.traits, events)
+    bus = BusService("arm", options, protocol.driver(options, models), protocol.codec(options), link.traits, events)
     await link.connect(bus.master)
     if started:
         await bus.start()
-        puppet.heard.clear()
+        puppet.frames.clear()
     try:
         yield bus, puppet, link, events
     finally:

@@ -43,7 +43,7 @@ def test_goals_of_several_servos_leave_together_in_the_order_they_came() -> None
     assert coalescer.take(0.0, ALL) is None
 
 
-def test_a_newer_goal_supersedes_the_older_and_keeps_its_place() -> None:
+def test_a_newer_goal_supersedes_the_older_and_keeps_its_turn() -> None:
     ended: Ended = []
     newer = ticket(1, ended)
     coalescer = coalescer_of(ticket(1, ended), ticket(2, ended), newer)
@@ -124,7 +124,7 @@ def test_when_a_member_expires_its_batch_is_withheld() -> None:
     assert len(coalescer) == 0
 
 
-def test_a_goal_whose_caller_left_is_dropped_and_nobody_is_told() -> None:
+def test_a_goal_whose_caller_left_is_dropped_without_a_result() -> None:
     ended: Ended = []
     left = False
     coalescer = coalescer_of(ticket(1, ended, gone=lambda: left), ticket(2, ended))

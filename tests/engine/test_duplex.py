@@ -49,14 +49,14 @@ async def read_all(rig: LocalRig, rounds: int) -> float:
     return loop.time() - began
 
 
-@pytest.mark.parametrize("greatest", [0.0, 0.1, 0.3, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("max_delay_ms", [0.0, 0.1, 0.3, 0.5, 1.0, 2.0])
 @virtual
-async def test_answers_never_meet_over_the_whole_range_of_delays(greatest: float) -> None:
-    rng = random.Random(greatest)
-    async with open_rig(config("full", delays=f"[0, {greatest}]")) as rig:
+async def test_answers_never_meet_over_the_whole_range_of_delays(max_delay_ms: float) -> None:
+    rng = random.Random(max_delay_ms)
+    async with open_rig(config("full", delays=f"[0, {max_delay_ms}]")) as rig:
         for _ in range(40):
             for device in devices(rig):
-                device.delay = rng.choice((0.0, greatest / 1000, rng.uniform(0, greatest / 1000)))
+                device.delay = rng.choice((0.0, max_delay_ms / 1000, rng.uniform(0, max_delay_ms / 1000)))
             await read_all(rig, 3)
         assert link_of(rig).line.collisions == 0
         assert rig.stats()["line"].get("timeouts", 0) == 0

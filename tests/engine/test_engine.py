@@ -17,7 +17,7 @@ from tests.engine.toy_protocol import ANSWER, PING, READ, REFUSED, group_read, r
 # The plain way
 
 
-def test_a_request_is_said_and_its_caller_results() -> None:
+def test_a_request_is_sent_and_its_caller_gets_the_value() -> None:
     rig = Rig()
     results = rig.submit(read(1, 5))
     assert rig.engine.idle
@@ -138,7 +138,7 @@ def test_a_plan_is_results_of_the_fence_that_failed_and_goes_its_own_way() -> No
 # Retries
 
 
-def test_what_may_be_repeated_is_said_up_to_its_tries_each_behind_a_fence() -> None:
+def test_an_idempotent_request_is_repeated_behind_a_fence_each_time() -> None:
     rig = Rig()
     results = rig.submit(read(1, 5))
     for attempt in range(TRIES):
@@ -168,7 +168,7 @@ def test_a_plan_repeats_its_frame_and_keeps_the_line() -> None:
 
 
 @pytest.mark.parametrize(("request_", "traits"), [(read(1, 5, idempotent=False), {}), (read(1, 5), {"tries": 1})])
-def test_what_may_not_be_repeated_is_said_once(request_: Request[Any], traits: dict[str, Any]) -> None:
+def test_a_request_that_is_not_idempotent_is_sent_once(request_: Request[Any], traits: dict[str, Any]) -> None:
     rig = Rig()
     results = rig.submit(request_, **traits)
     assert rig.miss() == ask(5)
@@ -186,7 +186,7 @@ def test_an_offline_node_is_asked_once() -> None:
     assert rig.next() == b""
 
 
-def test_a_request_that_was_heard_back_is_asked_differently() -> None:
+def test_a_request_whose_echo_came_is_asked_differently() -> None:
     rig = Rig()
     results = rig.submit(write(1, 5))
     assert rig.hear(write(1, 5).frame).echoes == 1

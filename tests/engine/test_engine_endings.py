@@ -192,7 +192,7 @@ def test_a_stray_of_a_node_nobody_asked_or_configured_is_only_counted() -> None:
     assert (rig.node(77).health, rig.stats.counts[Counter.STRAYS]) == ("online", 1)
 
 
-def test_a_doubled_answer_of_a_node_that_is_looked_for_makes_it_doubtful() -> None:
+def test_a_doubled_reply_of_a_node_of_this_request_makes_it_doubtful() -> None:
     rig = Rig()
     rig.submit(read(77, 5), even_if_offline=True)
     rig.hear(reply(77, READ, 9).frame * 2)

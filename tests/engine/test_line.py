@@ -37,7 +37,7 @@ def quiet_line(**traits: Any) -> Line:
 # Quiet
 
 
-def test_after_opening_it_is_listened_to_for_the_start_quiet() -> None:
+def test_after_the_port_opened_the_line_must_be_silent() -> None:
     line = opened(5.0)
     assert line.waiting_for_silence
     assert line.ready_at(5.0, estop_pending=False) == line.ready_at(5.0, estop_pending=True) == 5.0 + START_QUIET
@@ -56,7 +56,7 @@ def test_after_a_miss_it_is_listened_out_until_it_was_quiet() -> None:
     assert line.drains == 2, "the opening and this"
 
 
-def test_a_longer_silence_is_not_cut_short_by_what_is_heard() -> None:
+def test_bytes_that_arrive_do_not_shorten_a_longer_silence() -> None:
     line = opened(5.0)
     line.wait_for_silence(5.001)
     assert line.ready_at(5.002, estop_pending=False) == 5.0 + START_QUIET
@@ -131,7 +131,7 @@ def test_bytes_take_their_time_and_the_next_frame_queues_behind_those_that_are_l
     assert line.sent_by == pytest.approx(1.02)
 
 
-def test_at_most_one_frame_waits_behind_the_one_that_is_leaving() -> None:
+def test_no_more_than_one_frame_waits_behind_the_one_that_is_leaving() -> None:
     line = quiet_line(baudrate=10_000)
     line.send(FRAME, 1.0, 0.0)
     line.send(FRAME, 1.0, 0.0)
@@ -142,7 +142,7 @@ def test_at_most_one_frame_waits_behind_the_one_that_is_leaving() -> None:
     assert line.ready_at(1.0101, estop_pending=False) <= 1.0101
 
 
-def test_what_is_heard_meanwhile_lets_no_third_frame_in() -> None:
+def test_bytes_that_arrive_meanwhile_let_no_third_frame_in() -> None:
     line = quiet_line(baudrate=10_000)
     line.send(FRAME, 1.0, 0.0)
     line.send(FRAME, 1.0, 0.0)
@@ -205,7 +205,7 @@ def test_our_own_bytes_are_taken_out_however_they_are_cut() -> None:
     assert echo.collisions == 0
 
 
-def test_something_else_where_our_bytes_are_due_is_a_collision_and_is_heard() -> None:
+def test_other_bytes_where_our_own_are_due_are_a_collision_and_kept() -> None:
     echo = EchoFilter()
     echo.sent(b"abc")
     assert echo.strip(b"aXc") == b"aXc"

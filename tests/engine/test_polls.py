@@ -20,8 +20,8 @@ def test_polls_of_one_rate_are_spread_over_their_period() -> None:
     grid.set([poll("a", 10, 1), poll("b", 10, 2)], 5.0)
     taken = []
     for now in (5.0, 5.049, 5.05, 5.099, 5.1):
-        found = grid.take(now)
-        taken.append(found and found.name)
+        due = grid.take(now)
+        taken.append(due and due.name)
     assert taken == ["a", None, "b", None, "a"]
 
 
@@ -38,8 +38,8 @@ def test_the_longest_due_goes_first() -> None:
     grid = PollGrid()
     grid.set([poll("slow", 1, 1), poll("fast", 100, 2)], 0.0)
     names = []
-    while (found := grid.take(0.5)) is not None:
-        names.append(found.name)
+    while (due := grid.take(0.5)) is not None:
+        names.append(due.name)
     assert names[0] == "slow"
     assert "fast" in names
     assert grid.due > 0.5

@@ -13,7 +13,7 @@ from tests.engine.toy_protocol import ANSWER, READ, Bench, Sink, read, ticket
 # Goals
 
 
-def test_goals_of_one_tick_are_one_turn_and_each_is_told_its_outcome() -> None:
+def test_goals_of_one_tick_are_one_plan_and_each_gets_its_outcome() -> None:
     bench, ended = Bench(), Ended()
     for number in (1, 2, 3):
         bench.coalescer.put(ticket(number, ended))
@@ -180,7 +180,7 @@ def test_what_was_queued_when_its_node_went_offline_does_not_wait_longer_than_wh
     assert isinstance(results(queued)[0], ReplyTimeout)
 
 
-def test_urgent_requests_are_said_to_an_offline_node() -> None:
+def test_a_job_marked_even_if_offline_is_sent_to_an_offline_node() -> None:
     bench = Bench(1)
     bench.scheduler.queue(before := job(1, even_if_offline=True), 0.0)
     bench.take_offline(1)

@@ -24,8 +24,8 @@ REFUSED = 0xEE
 
 
 def encode(node: int, *payload: int) -> bytes:
-    body = bytes((node, len(payload), *payload))
-    return b"\xa5" + body + bytes((sum(body) & 0xFF,))
+    content = bytes((node, len(payload), *payload))
+    return b"\xa5" + content + bytes((sum(content) & 0xFF,))
 
 
 @dataclass(frozen=True, slots=True)
