@@ -28,7 +28,7 @@ async def test_a_servo_that_comes_while_the_queue_is_full_is_identified() -> Non
         callers = [asyncio.create_task(caller()) for _ in range(QUEUE_LIMIT + 100)]
         await asyncio.sleep(0.1)
         puppet.script = lambda frame: None
-        await asyncio.sleep(10)
+        await asyncio.sleep(1.5)
         for each in callers:
             each.cancel()
         await asyncio.gather(*callers, return_exceptions=True)

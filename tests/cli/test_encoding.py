@@ -72,6 +72,7 @@ def test_a_substitute_keeps_the_columns_aligned() -> None:
 @pytest.mark.parametrize(
     "environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}]
 )
+@pytest.mark.slow
 def test_a_process_without_utf_8(environment: dict[str, str], config: Path) -> None:
     process = subprocess.run(
         [sys.executable, "-m", "servobus", "read", "-c", str(config)],

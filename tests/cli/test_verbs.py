@@ -282,6 +282,7 @@ def test_a_dry_run_opens_no_port(call: Call, rig: Path) -> None:
     assert json.loads(call.out)["arm/shoulder"]["position"] == 0
 
 
+@pytest.mark.slow
 def test_demo(call: Call) -> None:
     rows = call.json("demo", "--seconds", "0.5")
     assert {name: row["errors"] for name, row in rows.items()} == {"arm": 0, "base": 0, "gimbal": 0, "hand": 0}

@@ -42,11 +42,13 @@ def run(configure: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
 
 
+@pytest.mark.slow
 def test_a_library_program_with_a_dead_servo_prints_nothing() -> None:
     process = run("")
     assert (process.stdout, process.stderr) == ("", "")
 
 
+@pytest.mark.slow
 def test_a_program_that_configures_logging_reads_events() -> None:
     process = run("import logging; logging.basicConfig(level=logging.INFO)")
     assert "WARNING:servobus.rig:servo_offline: bus=arm servo=s1 id=1" in process.stderr
