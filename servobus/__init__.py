@@ -39,19 +39,7 @@ if TYPE_CHECKING:
     from servobus.rig.interface import Rig, Servo
     from servobus.rig.local import LocalRig
     from servobus.rig.local import open_rig as open
-    from servobus.values import (
-        Change,
-        EventName,
-        Goal,
-        Health,
-        Identity,
-        Outcome,
-        Reload,
-        ScanHit,
-        Snapshot,
-        State,
-        StopReport,
-    )
+    from servobus.values import Change, EventName, Goal, Health, Identity, Outcome, Reload, ScanHit, Snapshot, State, StopReport
 
     __version__: str
 
@@ -107,7 +95,7 @@ _MODULES = {
     "rig.interface": {"Rig", "Servo"},
     "rig.events": {"Event", "EventStream"},
     "values": {
-        *("Change", "EventName", "Goal", "Health", "Identity", "Outcome", "Reload", "ScanHit", "Snapshot", "State", "StopReport"),
+        *("Change", "EventName", "Goal", "Health", "Identity", "Outcome", "Reload", "ScanHit", "Snapshot", "State", "StopReport")
     },
 }
 

@@ -34,13 +34,7 @@ class ServobusError(Exception):
     raw: bytes
 
     def __init__(
-        self,
-        message: str,
-        *,
-        bus: str | None = None,
-        servo: str | None = None,
-        request: object = None,
-        raw: bytes = b"",
+        self, message: str, *, bus: str | None = None, servo: str | None = None, request: object = None, raw: bytes = b""
     ) -> None:
         super().__init__(message)
         self.__dict__.update(message=message, bus=bus, servo=servo, request=request, raw=raw)

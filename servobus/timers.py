@@ -16,8 +16,7 @@ from collections.abc import Callable
 
 CLOCK_MONOTONIC = 1
 TFD_NONBLOCK, TFD_CLOEXEC, TFD_TIMER_ABSTIME = os.O_NONBLOCK, os.O_CLOEXEC, 1
-VIRTUAL = "virtual_time"
-"""A loop with this attribute set keeps a time of its own."""
+VIRTUAL = "virtual_time"  # a loop with this attribute set keeps a time of its own
 
 
 class _Spec(ctypes.Structure):
@@ -106,8 +105,7 @@ class CoarseTimer:
         self._clock = clock_of(loop)
         self._callback = callback
         self._handle: asyncio.TimerHandle | None = None
-        self.at = math.inf
-        """When it calls back; infinite: it is not set."""
+        self.at = math.inf  # when it calls back; infinite: it is not set
 
     def by(self, when: float) -> None:
         """At `when` (seconds of `clock_of`) at the latest."""

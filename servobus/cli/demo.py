@@ -20,8 +20,7 @@ from servobus.values import Outcome
 GOAL_HZ = 100.0
 FEEDBACK_HZ = 50.0
 FINGERS = ("thumb_bend", "index", "middle", "ring", "little", "thumb_rotation")
-PERIOD_S = 4.0
-"""Duration of one swing."""
+PERIOD_S = 4.0  # duration of one swing
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,7 @@ class Options:
     trace: bool
     dry_run: bool
     direct: bool = False
-    parsed: Any = None
-    """A Config to use instead of a file."""
+    parsed: Any = None  # a Config to use instead of a file
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +47,7 @@ class BusFacts:
 
     protocol: str
     port: str
-    polled: bool
-    """The bus polls its servos, so their last states are fresh."""
+    polled: bool  # the bus polls its servos, so their last states are fresh
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,12 +44,7 @@ def _load(path: str | None) -> Config:
 
 @asynccontextmanager
 async def open_own(
-    options: Options,
-    names: Collection[str],
-    only: Collection[str],
-    before: Callable[[Config], object] | None,
-    *,
-    degraded: bool,
+    options: Options, names: Collection[str], only: Collection[str], before: Callable[[Config], object] | None, *, degraded: bool
 ) -> AsyncIterator[RigContext]:
     """Open the ports; the arguments are those of `rig_context.open_context`."""
     config = config_of(options)

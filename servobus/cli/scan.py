@@ -12,8 +12,7 @@ from servobus.cli.options import Options, servo_options
 from servobus.cli.output import echo, echo_table, emit
 from servobus.errors import ServobusError
 
-NO_ANSWER = 1
-"""The exit status of a scan that finds nothing."""
+NO_ANSWER = 1  # the exit status of a scan that finds nothing
 COLUMNS = ("id", "baud rate", "model", "product", "firmware", "note")
 
 

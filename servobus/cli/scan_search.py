@@ -20,8 +20,7 @@ from servobus.values import ScanHit
 
 INTERRUPTED = 130
 MIN_RATE, MAX_RATE = 300, 10_000_000
-BUS = "line"
-"""Name of the bus of a bare port."""
+BUS = "line"  # name of the bus of a bare port
 
 
 class Search:
@@ -31,8 +30,7 @@ class Search:
         self, options: Options, bus: str | None, port: str | None, protocol: str, rates: str | None, ids: str | None
     ) -> None:
         self.hits: list[ScanHit] = []
-        self.target = ScanTarget(bus or "", "", "")
-        """Complete when a rig was reached; for a bare port from the beginning."""
+        self.target = ScanTarget(bus or "", "", "")  # complete when a rig was reached; for a bare port from the beginning
         self._options = options
         self._bus = bus
         self._rates = rates

@@ -16,19 +16,7 @@ from typing import Any, Protocol, cast
 
 from servobus.config.access import DoorOptions, Role
 from servobus.daemon.fairness import FairShare, TokenBucket
-from servobus.daemon.jsonrpc import (
-    URGENT,
-    Call,
-    Framer,
-    Refused,
-    call_of,
-    encode,
-    failure,
-    notification,
-    parse,
-    success,
-    urgent,
-)
+from servobus.daemon.jsonrpc import URGENT, Call, Framer, Refused, call_of, encode, failure, notification, parse, success, urgent
 from servobus.daemon.methods import HANDLERS, Services, require_role
 from servobus.errors import ServobusError
 from servobus.rig.logs import EventLogger
@@ -37,16 +25,11 @@ from servobus.rpc.methods import Hello
 MAX_WAITING = 256 * 1024
 """Bytes of one client that may wait; above it the client is not read. More than our own client lets wait, so that its `stop` is
 always read."""
-MAX_TASKS = 256
-"""Calls of one client under way at once; above it only urgent ones begin."""
-MAX_UNREAD = 256 * 1024
-"""Bytes that a client may be behind with reading."""
-MAX_BLOCKED = 10.0
-"""Seconds after which a client that reads nothing is disconnected."""
-OVERHEAD = 64
-"""Bytes that a waiting line takes besides its text."""
-MAX_LABEL = 64
-"""Letters of a client's name."""
+MAX_TASKS = 256  # calls of one client under way at once; above it only urgent ones begin
+MAX_UNREAD = 256 * 1024  # bytes that a client may be behind with reading
+MAX_BLOCKED = 10.0  # seconds after which a client that reads nothing is disconnected
+OVERHEAD = 64  # bytes that a waiting line takes besides its text
+MAX_LABEL = 64  # letters of a client's name
 
 log = EventLogger("servobus.daemon")
 
@@ -79,23 +62,18 @@ class ClientConnection(asyncio.Protocol):
     def __init__(self, door: Door, *, tcp: bool = False) -> None:
         self.door = door
         self.role = Role.NOBODY
-        self.blocked = False
-        """The client does not read: only replies to its calls are written."""
+        self.blocked = False  # the client does not read: only replies to its calls are written
         self.who = ""
         self._name = ""
         self._tcp = tcp
         self._framer = Framer()
         self._lines: deque[bytes] = deque()
-        self._waiting = 0
-        """Bytes that they take."""
+        self._waiting = 0  # bytes that they take
         self._tasks: set[asyncio.Task[None]] = set()
-        self._scheduled = False
-        """A next line will be handled without further ado."""
-        self._paused = False
-        """The socket is not read."""
+        self._scheduled = False  # a next line will be handled without further ado
+        self._paused = False  # the socket is not read
         self._closed = False
-        self._at_eof = False
-        """The client sends nothing more."""
+        self._at_eof = False  # the client sends nothing more
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport
 

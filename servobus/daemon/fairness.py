@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from time import perf_counter
 
-BUDGET = 0.001
-"""Seconds of each pass that clients may use."""
+BUDGET = 0.001  # seconds of each pass that clients may use
 
 
 class FairShare:
@@ -22,8 +21,7 @@ class FairShare:
         self._now = now
         self._pieces: deque[Callable[[], bool]] = deque()
         self._due = False
-        self._until: float | None = None
-        """When the share of this pass is used up."""
+        self._until: float | None = None  # when the share of this pass is used up
 
     def add(self, piece: Callable[[], bool]) -> None:
         self._pieces.append(piece)

@@ -14,8 +14,7 @@ from servobus.errors import LeaseHeld
 
 @dataclass(slots=True)
 class _Holder:
-    label: str
-    """Its name for other clients."""
+    label: str  # its name for other clients
     servos: set[str]
     expires: float
 
@@ -24,8 +23,7 @@ class Leases:
     """Clients are any hashable objects, servos are full names, times are seconds."""
 
     def __init__(self, ttl: float) -> None:
-        self.ttl = ttl
-        """Seconds."""
+        self.ttl = ttl  # seconds
         self._holders: dict[Hashable, _Holder] = {}
         self._owner: dict[str, Hashable] = {}
         self._lost: dict[Hashable, set[str]] = {}

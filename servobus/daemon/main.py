@@ -19,8 +19,7 @@ from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig, open_rig
 from servobus.rig.logs import EventLogger
 
-CHECKS = 3
-"""Checks of the buses within the time that the system's watchdog allows."""
+CHECKS = 3  # checks of the buses within the time that the system's watchdog allows
 
 log = EventLogger("servobus.daemon")
 

@@ -31,10 +31,8 @@ from servobus.rpc.methods import (
 )
 from servobus.values import Health, Role, ScanHit
 
-MAX_SCAN = 65_536
-"""Ids and rates of one scan."""
-MAX_SETTLE = 3600.0
-"""Seconds."""
+MAX_SCAN = 65_536  # ids and rates of one scan
+MAX_SETTLE = 3600.0  # seconds
 
 
 class Client(Subscriber, Protocol):

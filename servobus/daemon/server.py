@@ -21,10 +21,8 @@ from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.rig.local import LocalRig
 from servobus.rig.logs import EventLogger
 
-HANDSHAKE = 5.0
-"""Seconds."""
-CLOSING = 1.0
-"""Seconds that connections get to close at the end."""
+HANDSHAKE = 5.0  # seconds
+CLOSING = 1.0  # seconds that connections get to close at the end
 
 log = EventLogger("servobus.daemon")
 
@@ -49,15 +47,12 @@ class NativeDoor:
         self.leases = LeaseWatch(rig, self.options.lease_ms)
         self.subscriptions = Subscriptions(rig)
         self.services = Services(rig, self.leases, self.subscriptions)
-        self.addresses: list[str] = []
-        """Where it listens, for people."""
-        self.connections: dict[ClientConnection, str] = {}
-        """Client -> whose it counts as."""
+        self.addresses: list[str] = []  # where it listens, for people
+        self.connections: dict[ClientConnection, str] = {}  # client -> whose it counts as
         self._count: Counter[str] = Counter()
         self._tokens: Tokens | None = None
         self._servers: list[asyncio.Server] = []
-        self._empty = asyncio.Event()
-        """After closing: no connection is left."""
+        self._empty = asyncio.Event()  # after closing: no connection is left
 
     # Who may connect
 

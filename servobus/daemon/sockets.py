@@ -17,16 +17,13 @@ from pathlib import Path
 from servobus.config.access import TcpOptions
 from servobus.errors import AccessDenied, ConfigError, Overloaded, PortBusy
 
-GROUP = "servobus"
-"""Members of this group may open the socket, where the system has it."""
+GROUP = "servobus"  # members of this group may open the socket, where the system has it
 FOLDER_MODE, SOCKET_UMASK = 0o750, 0o117
 CREDENTIALS = struct.Struct("3i")
 MIN_TOKEN = 32
-TRIES, WINDOW = 5, 60.0
-"""Wrong tokens that one address may try within so many seconds."""
+TRIES, WINDOW = 5, 60.0  # wrong tokens that one address may try within so many seconds
 BACKLOG = 1024
-MAX_PATH = 107
-"""Bytes of a socket's path: sun_path of Linux, less its final zero."""
+MAX_PATH = 107  # bytes of a socket's path: sun_path of Linux, less its final zero
 
 
 def peer_credentials(sock: socket.socket) -> tuple[int, int, int]:

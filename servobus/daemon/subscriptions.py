@@ -28,18 +28,15 @@ class Topic(StrEnum):
 
 
 FIELDS = frozenset(State.__dataclass_fields__)
-SAME_MOMENT = 0.004
-"""Seconds for which an encoded state is good for another subscription."""
-SHARE = 64
-"""Subscriptions served in one pass of the loop."""
+SAME_MOMENT = 0.004  # seconds for which an encoded state is good for another subscription
+SHARE = 64  # subscriptions served in one pass of the loop
 SPREAD = 0.618
 
 
 class Subscriber(Hashable, Protocol):
     """What a subscription needs of the connection of its client."""
 
-    blocked: bool
-    """The client does not read what was written."""
+    blocked: bool  # the client does not read what was written
 
     def write(self, data: bytes) -> None: ...
 
@@ -74,8 +71,7 @@ class Subscriptions:
         self._heap: list[Subscription] = []
         self._of: dict[Subscriber, dict[int, Subscription]] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0
-        """Kept here: a timer of uvloop that is due already does not say when."""
+        self._timer_at = 0.0  # kept here: a timer of uvloop that is due already does not say when
         self._encoded: dict[str, bytes] = {}
         self._encoded_at = -1.0
         self._unlisten = rig.event_source.subscribe(self._event)

@@ -11,14 +11,10 @@ from dataclasses import dataclass
 class Pulse:
     """The counters of one bus at one moment."""
 
-    up: bool
-    """The line is open."""
-    frames: int
-    """Frames sent so far."""
-    received: int
-    """Bytes received so far."""
-    waiting: int
-    """Jobs that wait."""
+    up: bool  # the line is open
+    frames: int  # frames sent so far
+    received: int  # bytes received so far
+    waiting: int  # jobs that wait
 
 
 class Watchdog:

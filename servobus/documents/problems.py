@@ -15,10 +15,8 @@ from pydantic import BaseModel, ValidationError
 from servobus.documents.reader import Document, KeyPath, Mark, clip
 from servobus.errors import ConfigError
 
-Mistake: TypeAlias = Mapping[str, Any]
-"""pydantic's description of one mistake: type, loc, msg, input, ctx."""
-MAX_REPORTED = 20
-"""Lines of problems; a file with more mistakes is probably no config at all."""
+Mistake: TypeAlias = Mapping[str, Any]  # pydantic's description of one mistake: type, loc, msg, input, ctx
+MAX_REPORTED = 20  # lines of problems; a file with more mistakes is probably no config at all
 WORDING = {
     "Input should be a valid tuple": "expected a list",
     "Input should be ": "expected ",

@@ -36,22 +36,16 @@ from servobus.errors import ConfigError
 
 MAX_BYTES = 64 * 1024
 MAX_DEPTH = 16
-MAX_NODES = 5000
-"""Keys and values. The parser takes about 15 us for each, so this limit bounds its time."""
+MAX_NODES = 5000  # keys and values. The parser takes about 15 us for each, so this limit bounds its time.
 MAX_INTEGER = (1 << 63) - 1
-MAX_SHOWN = 60
-"""Characters of the text that an error may repeat."""
+MAX_SHOWN = 60  # characters of the text that an error may repeat
 
 KeyPath: TypeAlias = tuple[str | int, ...]
-Mark: TypeAlias = tuple[int, int]
-"""Line and column, counted from 1."""
+Mark: TypeAlias = tuple[int, int]  # line and column, counted from 1
 
 FORBIDDEN = re.compile(r"[^\n\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]")
 """Tabs, byte-order marks, control characters, surrogates, and characters that change the direction of writing."""
-FORBIDDEN_HINTS = {
-    "\t": "found a tab; use spaces",
-    "\ufeff": "found a byte-order mark; save the file as UTF-8 without one",
-}
+FORBIDDEN_HINTS = {"\t": "found a tab; use spaces", "\ufeff": "found a byte-order mark; save the file as UTF-8 without one"}
 MARKER = re.compile(r"^(?:---(?=[ \n]|\Z)|\.\.\.(?=[ \n]|\Z)|%)", re.MULTILINE)
 BEFORE_DOCUMENT = re.compile(r"(?:[ ]*(?:#[^\n]*)?\n)*")
 BRACKET = re.compile(r"[\[\]{}]")

@@ -14,8 +14,7 @@ from servobus.errors import AccessDenied, ConfigError, LinkDown
 from servobus.remote.connection import DaemonConnection
 from servobus.rpc.socket_path import find_socket, socket_path
 
-CONNECT_TIMEOUT = 5.0
-"""Seconds for the connection to open."""
+CONNECT_TIMEOUT = 5.0  # seconds for the connection to open
 MAX_TOKEN = 4096
 
 

@@ -18,12 +18,9 @@ from servobus.errors import InvalidRequest, LimitError, LinkDown, Overloaded, Re
 from servobus.rpc.errors import decoded
 from servobus.rpc.methods import MAX_LINE, METHODS
 
-MAX_REPLY = 4 * 1024 * 1024
-"""Bytes of one line from the daemon."""
-MAX_WAITING = 1024
-"""Calls of one connection that wait for their replies."""
-MAX_UNSENT = 1024 * 1024
-"""Bytes that the daemon has not taken yet, above which nothing more is sent."""
+MAX_REPLY = 4 * 1024 * 1024  # bytes of one line from the daemon
+MAX_WAITING = 1024  # calls of one connection that wait for their replies
+MAX_UNSENT = 1024 * 1024  # bytes that the daemon has not taken yet, above which nothing more is sent
 
 
 class _Message(msgspec.Struct):
@@ -73,10 +70,8 @@ class DaemonConnection(asyncio.Protocol):
         lost: Callable[[DaemonConnection, LinkDown], None] = lambda *_: None,
     ) -> None:
         self.address = address
-        self.down: LinkDown | None = None
-        """Why the connection has ended."""
-        self.received_at = 0.0
-        """Loop time of the last bytes."""
+        self.down: LinkDown | None = None  # why the connection has ended
+        self.received_at = 0.0  # loop time of the last bytes
         self._notice = notice
         self._lost = lost
         self._loop = asyncio.get_running_loop()

@@ -12,8 +12,7 @@ class HeldLeases:
     """Servos by full name."""
 
     def __init__(self) -> None:
-        self.ttl = 0.5
-        """Seconds that a lease lasts; the daemon says how long."""
+        self.ttl = 0.5  # seconds that a lease lasts; the daemon says how long
         self.held: set[str] = set()
         self._until = 0.0
         self._lost: set[str] = set()

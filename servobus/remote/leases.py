@@ -11,8 +11,7 @@ from servobus.errors import LeaseHeld, LinkDown, ReplyTimeout, ServobusError
 from servobus.remote.held_leases import HeldLeases
 from servobus.remote.session import Session
 
-RELEASE_TIMEOUT = 1.0
-"""Seconds that leaving waits for the daemon."""
+RELEASE_TIMEOUT = 1.0  # seconds that leaving waits for the daemon
 
 
 class ClientLeases:
@@ -22,8 +21,7 @@ class ClientLeases:
         self._session = session
         self._held = HeldLeases()
         self._clock = asyncio.get_running_loop().time
-        self._moving = 0
-        """Motion calls under way."""
+        self._moving = 0  # motion calls under way
         self._renewing: asyncio.Task[None] | None = None
 
     def begin(self, ttl: float) -> None:

@@ -44,12 +44,9 @@ from servobus.values import (
 )
 
 T = TypeVar("T")
-FOREVER = 1e9
-"""Seconds in place of an infinity, which JSON does not have."""
-MIN_LEASE = 0.1
-"""Seconds: no daemon makes this client renew more often than this asks for."""
-REFRESH_TIMEOUT = 1.0
-"""Seconds that a verb which is done waits for the states that it changed."""
+FOREVER = 1e9  # seconds in place of an infinity, which JSON does not have
+MIN_LEASE = 0.1  # seconds: no daemon makes this client renew more often than this asks for
+REFRESH_TIMEOUT = 1.0  # seconds that a verb which is done waits for the states that it changed
 
 
 @asynccontextmanager

@@ -14,14 +14,11 @@ from servobus.remote.connection import DaemonConnection
 from servobus.rig.verbs import DEADLINE
 from servobus.rpc.methods import METHODS, PROTOCOL, Greeting
 
-FIRST_DELAY, MAX_DELAY = 0.05, 2.0
-"""Seconds between two attempts to connect again."""
+FIRST_DELAY, MAX_DELAY = 0.05, 2.0  # seconds between two attempts to connect again
 GREETING_TIMEOUT = 5.0
-SILENCE = 5.0
-"""Seconds without a byte from a daemon that sends notices, after which it hangs or the network is cut."""
+SILENCE = 5.0  # seconds without a byte from a daemon that sends notices, after which it hangs or the network is cut
 
-Opener = Callable[[Callable[[], DaemonConnection]], Awaitable[DaemonConnection]]
-"""Opens a connection that the function makes."""
+Opener = Callable[[Callable[[], DaemonConnection]], Awaitable[DaemonConnection]]  # opens a connection that the function makes
 _notice = msgspec.json.Decoder(dict[str, Any]).decode
 
 
@@ -31,8 +28,7 @@ class WantedSubscription:
 
     params: dict[str, Any]
     sink: Callable[[dict[str, Any]], object]
-    numbers: set[int] = field(default_factory=set)
-    """The numbers that the present connection gave it."""
+    numbers: set[int] = field(default_factory=set)  # the numbers that the present connection gave it
 
 
 class Session:
@@ -67,8 +63,7 @@ class Session:
         self._progress = progress
         self._connection: DaemonConnection | None = None
         self._down = LinkDown(f"{address}: not connected yet")
-        self._subscriptions: dict[WantedSubscription, None] = {}
-        """In the order they were made."""
+        self._subscriptions: dict[WantedSubscription, None] = {}  # in the order they were made
         self._reconnecting: asyncio.Task[None] | None = None
         self._watchdog: asyncio.TimerHandle | None = None
         self._closed = False

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from weakref import WeakSet
 
-BACKLOG = 256
-"""Events that one slow reader may be behind. Older ones are dropped, and the reader sees how many."""
+BACKLOG = 256  # events that one slow reader may be behind. Older ones are dropped, and the reader sees how many.
 
 
 @dataclass(frozen=True, slots=True)

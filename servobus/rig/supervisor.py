@@ -23,25 +23,17 @@ from servobus.protocols.registry import PROTOCOLS
 from servobus.simulation.link import SIMULATED, SimulatedLink, simulated_link
 from servobus.values import EventName, StopReport
 
-Trace = Callable[[str, bool, bytes, float], None]
-"""(bus, sent, bytes, monotonic seconds) of everything on the wire."""
+Trace = Callable[[str, bool, bytes, float], None]  # (bus, sent, bytes, monotonic seconds) of everything on the wire
 
-RETRY = 0.1
-"""Seconds between two attempts to open a port."""
-EXIT_TIMEOUT = 1.0
-"""Seconds that the exit policies may take, besides parking."""
+RETRY = 0.1  # seconds between two attempts to open a port
+EXIT_TIMEOUT = 1.0  # seconds that the exit policies may take, besides parking
 
 
 class BusSupervisor:
     """`event(name, **fields)` is called with each event of the bus (see `EventName`)."""
 
     def __init__(
-        self,
-        name: str,
-        options: BusOptions,
-        models: Mapping[str, ServoModel],
-        event: Callable[..., None],
-        trace: Trace | None,
+        self, name: str, options: BusOptions, models: Mapping[str, ServoModel], event: Callable[..., None], trace: Trace | None
     ) -> None:
         protocol = PROTOCOLS[options.protocol]
         self.name = name
@@ -55,8 +47,7 @@ class BusSupervisor:
         self.bus = BusService(name, options, driver, protocol.codec(options), self.link.traits, event)
         if trace is not None:
             self.bus.master.trace = partial(trace, name)
-        self.tried = asyncio.Event()
-        """Set once the line was opened, or could not be."""
+        self.tried = asyncio.Event()  # set once the line was opened, or could not be
         self.down: LinkDown | None = None
         self.scope = anyio.CancelScope()
         self._event = event
