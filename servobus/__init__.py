@@ -7,6 +7,7 @@ asyncio. Everything is loaded when it is first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+# fmt: off
 if TYPE_CHECKING:
     from servobus import blocking
     from servobus.errors import (
@@ -44,51 +45,13 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "AccessDenied",
-    "ActionWithheld",
-    "Busy",
-    "Change",
-    "ConfigError",
-    "DeviceError",
-    "EStopped",
-    "EchoMismatch",
-    "Event",
-    "EventName",
-    "EventStream",
-    "Goal",
-    "GoalExpired",
-    "Health",
-    "Identity",
-    "InvalidRequest",
-    "LeaseHeld",
-    "LimitError",
-    "LinkDown",
-    "LocalRig",
-    "NotEnabled",
-    "NotSupported",
-    "Outcome",
-    "Overloaded",
-    "PartialFailure",
-    "PortBusy",
-    "PortDenied",
-    "PortMissing",
-    "Reload",
-    "RemoteRig",
-    "ReplyTimeout",
-    "Rig",
-    "ScanHit",
-    "Servo",
-    "ServobusError",
-    "SettleTimeout",
-    "Snapshot",
-    "State",
-    "StopReport",
-    "UnknownName",
-    "__version__",
-    "blocking",
-    "connect",
-    "open",
+    "AccessDenied", "ActionWithheld", "Busy", "Change", "ConfigError", "DeviceError", "EStopped", "EchoMismatch", "Event",
+    "EventName", "EventStream", "Goal", "GoalExpired", "Health", "Identity", "InvalidRequest", "LeaseHeld", "LimitError",
+    "LinkDown", "LocalRig", "NotEnabled", "NotSupported", "Outcome", "Overloaded", "PartialFailure", "PortBusy",
+    "PortDenied", "PortMissing", "Reload", "RemoteRig", "ReplyTimeout", "Rig", "ScanHit", "Servo", "ServobusError",
+    "SettleTimeout", "Snapshot", "State", "StopReport", "UnknownName", "__version__", "blocking", "connect", "open",
 ]
+# fmt: on
 _MODULES = {
     "rig.local": {"LocalRig", "open"},
     "remote.rig": {"RemoteRig", "connect"},

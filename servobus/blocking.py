@@ -1,12 +1,13 @@
 """The same rigs for scripts and notebooks: every verb waits until it is done.
 
 The rig lives in the event loop of a thread of its own (anyio's BlockingPortal), so that leases are renewed while the script
-computes. It may be used from several threads. Left by an exception, or with the process, the servos moved from here do their
-`on_lost_client`.
+computes. It may be used from several threads. A rig that is still in use when the process ends is left as by an exception: the
+servos moved from here do their `on_lost_client`, those of a rig of its own their `on_exit`.
 """
 
 from __future__ import annotations
 
+import atexit
 import functools
 import threading
 from collections.abc import AsyncIterator, Callable, Collection, Generator, Iterator, Mapping
@@ -27,6 +28,8 @@ from servobus.values import Snapshot
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_in_use: set[_Thread] = set()
+"""Left at the end of the process, while threads still run: a portal that is closed later waits for ever."""
 
 
 class _Thread:
@@ -40,6 +43,7 @@ class _Thread:
             stack.callback(self._portal.call, self._portal.stop, True)  # ends what other threads wait for
             self.rig = stack.enter_context(self._portal.wrap_async_context_manager(context))
             self._contexts = stack.pop_all()
+        _in_use.add(self)
 
     def wait(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call a function in the loop and wait for its result. Ctrl-C ends the waiting, and the call with it."""
@@ -61,7 +65,15 @@ class _Thread:
         self, kind: type[BaseException] | None = None, error: BaseException | None = None, trace: TracebackType | None = None
     ) -> None:
         if self._closing.acquire(blocking=False):  # else it is left already
+            _in_use.discard(self)
             self._contexts.__exit__(kind, error, trace)
+
+
+@atexit.register
+def _leave_all() -> None:
+    for thread in tuple(_in_use):
+        with suppress(Exception):  # nobody is left to see it
+            thread.close(SystemExit, SystemExit())
 
 
 class BlockingServo(ServoVerbs):

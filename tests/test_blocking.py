@@ -260,6 +260,31 @@ def test_a_rig_that_another_thread_waits_for_can_be_closed() -> None:
     assert len(errors) == 1
 
 
+UNCLOSED = """
+from pathlib import Path
+from servobus import blocking
+from servobus.config.loader import parse_config
+config = parse_config({text!r}, "arm.yaml", Path())
+rig = blocking.open(config)
+rig.enable()
+events = rig.events()
+import atexit
+blocking.atexit.unregister(blocking._leave_all)
+atexit.register(lambda: print("left:", rig._thread.rig.left["arm/s1"].action))
+atexit.register(blocking._leave_all)
+{end}
+"""
+
+
+@pytest.mark.parametrize(("end", "status"), [("", 0), ("raise SystemExit(3)", 3), ("raise ValueError", 1)])
+def test_a_script_that_forgets_to_close_ends_and_applies_on_exit(end: str, status: int) -> None:
+    bus = "{protocol: sms, port: 'sim:', baudrate: 1000000, servos: {s1: {id: 1, model: sts, on_exit: limp}}}"
+    text = f"version: 1\nbuses: {{arm: {bus}}}\n"
+    code = UNCLOSED.format(text=text, end=end)
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert (process.stdout, process.returncode) == ("left: limp\n", status), process.stderr
+
+
 def test_the_stub_is_what_the_script_writes() -> None:
     script = runpy.run_path(str(Path(__file__).parent.parent / "scripts" / "stubs"))
     text = script["stub"]((script["RIG"] / "interface.py").read_text())
