@@ -99,16 +99,16 @@ def signature(verb: Verb) -> inspect.Signature:
 
 def fields(verb: Verb) -> list[tuple[str, Any] | tuple[str, Any, Any]]:
     """The parameters as fields of a message: name, type, and default where there is one."""
-    found: list[tuple[str, Any] | tuple[str, Any, Any]] = []
+    columns: list[tuple[str, Any] | tuple[str, Any, Any]] = []
     for parameter in signature(verb).parameters.values():
         if parameter.kind is parameter.VAR_POSITIONAL:
-            found.append((parameter.name, GenericAlias(tuple, (parameter.annotation, ...)), ()))
+            columns.append((parameter.name, GenericAlias(tuple, (parameter.annotation, ...)), ()))
             continue
         kind, default = _message_type(parameter.annotation, goal=verb.lease is TAKEN), parameter.default
         if kind is bool and default is None:  # a callback: whether its calls are wanted
             default = False
-        found.append((parameter.name, kind) if default is parameter.empty else (parameter.name, kind, default))
-    return found
+        columns.append((parameter.name, kind) if default is parameter.empty else (parameter.name, kind, default))
+    return columns
 
 
 def _message_type(kind: Any, *, goal: bool) -> Any:
