@@ -46,31 +46,11 @@ class BusService:
         self.nodes = NodeTable(set(driver.nodes.values()), max_allowance_s=max_allowance_s, changed=self._node_changed)
         servos = cast("Mapping[str, ServoOptions]", vars(options)["servos"])  # each protocol narrows it to its own class
         self.records = {servo: ServoRecord(servo, each, self.nodes.node(driver.nodes[servo])) for servo, each in servos.items()}
-        self.scheduler = Scheduler(
-            driver,
-            self.nodes,
-            enabled_servos=self._enabled_on,
-            on_update=self._polled,
-            on_restart=self._restarted,
-            on_cut=self._cut,
-            on_setpoint=self._setpoint_sent,
-            goal_rate_hz=options.rate_of_goals,
-        )
+        self.scheduler = self._scheduler()
         self.engine = self._engine(codec)
         self.master = BusMaster(self.engine)
-        self.parts = BusParts(
-            name,
-            options,
-            driver,
-            self.records,
-            self.nodes,
-            self.scheduler,
-            self.line,
-            self.stats,
-            self.master,
-            self.clock,
-            emit,
-        )
+        shared = (self.records, self.nodes, self.scheduler, self.line, self.stats, self.master, self.clock, emit)
+        self.parts = BusParts(name, options, driver, *shared)
         requests = Requests(self.parts)
         self.ask = requests.ask
         self.perform = requests.perform
@@ -82,6 +62,18 @@ class BusService:
         self.exclusive = sessions.exclusive
         self.commission = sessions.commission
         self.set_baudrate = sessions.set_baudrate
+
+    def _scheduler(self) -> Scheduler:
+        return Scheduler(
+            self.driver,
+            self.nodes,
+            enabled_servos=self._enabled_on,
+            on_update=self._polled,
+            on_restart=self._restarted,
+            on_cut=self._cut,
+            on_setpoint=self._setpoint_sent,
+            goal_rate_hz=self.options.rate_of_goals,
+        )
 
     def _engine(self, codec: Codec) -> Engine:
         spread = self.options.spread
