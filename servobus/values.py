@@ -15,23 +15,11 @@ from servobus.errors import UnknownName
 
 
 class Described(StrEnum):
-    """A string enum whose members say in one sentence what they mean: `NAME = "name", "One sentence."`."""
-
-    description: str
-
-    def __new__(cls, value: str, description: str = "") -> Self:
-        member = str.__new__(cls, value)
-        member._value_ = value
-        member.description = description
-        return member
-
-
-class EventName(StrEnum):
-    """Every event of a rig: `NAME = "name", "One sentence.", "its fields"`."""
+    """A string enum whose members say in one sentence what they mean: `NAME = "name", "One sentence.", "its fields"`."""
 
     description: str
     fields: tuple[str, ...]
-    """What `Event.fields` holds."""
+    """Names of what comes with a member; of an event, what `Event.fields` holds."""
 
     def __new__(cls, value: str, description: str = "", fields: str = "") -> Self:
         member = str.__new__(cls, value)
@@ -39,6 +27,10 @@ class EventName(StrEnum):
         member.description = description
         member.fields = tuple(fields.split())
         return member
+
+
+class EventName(Described):
+    """Every event of a rig: `NAME = "name", "One sentence.", "its fields"`."""
 
     LINE_UP = "line_up", "The line of a bus was opened.", "bus port"
     LINE_DOWN = "line_down", "The line of a bus ended: its port is gone or its connection broke.", "bus port"
@@ -329,6 +321,16 @@ class Role(IntEnum):
 
     def __str__(self) -> str:
         return self.name.lower()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine, without asking a name server."""
+    from ipaddress import ip_address
+
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def is_number(value: object) -> bool:

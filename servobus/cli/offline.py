@@ -6,11 +6,11 @@ from typing import Any
 
 import click
 
+from servobus.cli.options import json_option
 from servobus.cli.output import echo, emit, report
 from servobus.errors import ConfigError, UnknownName
 
 LOAD_COLUMNS = ("bus", "goals %", "feedback %", "health %", "load %", "goal ms", "e-stop ms", "silent ms")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
 
 
 @click.command()

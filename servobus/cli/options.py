@@ -81,13 +81,16 @@ def parse_pairs(texts: Iterable[str], hint: str, example: str) -> dict[str, str]
     return pairs
 
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
+
+
 def servo_options(command: F) -> F:
     """Adds the options of every command on servos, and passes them on as one `options`."""
 
     @click.option(
         "-c", "--config", envvar="SERVOBUS_CONFIG", metavar="CONFIG", help="Bus config (YAML). Default: ./servobus.yaml."
     )
-    @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
+    @json_option
     @click.option("--trace", is_flag=True, help="Print every frame, sent and received, on standard error.")
     @click.option("--dry-run", is_flag=True, help="Open no port: use simulated servos, and print what would be sent.")
     @click.option("--direct", is_flag=True, help="Open the ports in this process even if a daemon runs.")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from servobus.cli.options import Number
+from servobus.cli.options import Number, json_option
 from servobus.cli.output import echo
 from servobus.errors import ConfigError
 
@@ -75,7 +75,7 @@ def sim(config: str, folder: Path | None) -> None:
 
 @click.command()
 @click.option("--seconds", default=10.0, show_default=True, type=Number(0.5, 3600), help="Time to stream goals.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document on standard output, for machines.")
+@json_option
 def demo(seconds: float, as_json: bool) -> int:
     """Stream goals to 20 simulated servos on four lines. Prints what the lines carried, with real wire time.
 

@@ -7,7 +7,6 @@ process, as the kernel reports them; through TCP it follows from the token.
 from __future__ import annotations
 
 import grp
-import ipaddress
 import os
 import pwd
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from typing import Annotated, Self
 from pydantic import Field, field_validator, model_validator
 
 from servobus.protocols.model import Data
-from servobus.values import Role
+from servobus.values import Role, is_loopback
 
 __all__ = ["AccessOptions", "DoorOptions", "Role", "TcpOptions", "TlsOptions"]
 
@@ -90,18 +89,9 @@ class TcpOptions(Data):
     tls: TlsOptions | None = None
     """Certificate and key for connections from other machines."""
 
-    @property
-    def loopback(self) -> bool:
-        if self.host == "localhost":
-            return True
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return False
-
     @model_validator(mode="after")
     def _safe(self) -> Self:
-        if self.tls is None and not self.loopback:
+        if self.tls is None and not is_loopback(self.host):
             raise ValueError(f"host {self.host} can be reached from other machines: give tls, or use 127.0.0.1")
         return self
 

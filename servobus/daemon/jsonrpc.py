@@ -6,6 +6,7 @@ A line is checked for its depth, and for a key that is in one object twice, beca
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
@@ -36,15 +37,13 @@ class Refused(Exception):
         return failed(self.call_id, {"code": self.code, "message": str(self)})
 
 
+@dataclass(slots=True)
 class Call:
     """One request or notification."""
 
-    __slots__ = ("id", "method", "params")
-
-    def __init__(self, method: str, params: Params, call_id: Any) -> None:
-        self.method = method
-        self.params = params
-        self.id = call_id
+    method: str
+    params: Params
+    id: Any
 
     @property
     def wants_reply(self) -> bool:

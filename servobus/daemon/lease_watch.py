@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Collection, Hashable
 
 from servobus.daemon.leases import Leases
 from servobus.rig.events import Event
@@ -21,20 +21,13 @@ class LeaseWatch:
     def __init__(self, rig: LocalRig, lease_ms: int) -> None:
         self.lease_ms = lease_ms
         self.leases = Leases(lease_ms / 1000)
+        self.holders, self.check, self.release = self.leases.holders, self.leases.check, self.leases.release
         self._rig = rig
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._labels: dict[Hashable, str] = {}
         self._stopping: set[asyncio.Task[None]] = set()
-
-    def holders(self) -> dict[str, str]:
-        """Servo -> the label of the client that holds it."""
-        return self.leases.holders()
-
-    def check(self, client: Hashable, servos: Iterable[str]) -> None:
-        """Refuse what another client holds. Raises LeaseHeld."""
-        self.leases.check(client, servos)
 
     def take(self, client: Hashable, label: str, servos: Collection[str]) -> None:
         """Take servos by moving them. Raises LeaseHeld."""
@@ -51,9 +44,6 @@ class LeaseWatch:
 
     def renew(self, client: Hashable) -> set[str]:
         return self.leases.renew(client, self._loop.time())
-
-    def release(self, client: Hashable, servos: Collection[str]) -> None:
-        self.leases.release(client, servos)
 
     def gone(self, client: Hashable) -> None:
         """The connection of the client is closed."""
@@ -74,13 +64,10 @@ class LeaseWatch:
     def _watch(self) -> None:
         expiry = self.leases.next_expiry()
         if expiry is not None and (self._timer is None or self._timer_at > expiry):
-            self._arm(expiry)
-
-    def _arm(self, when: float) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer_at = when
-        self._timer = self._loop.call_at(when, self._expire)
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer_at = expiry
+            self._timer = self._loop.call_at(expiry, self._expire)
 
     def _expire(self) -> None:
         self._timer = None
@@ -91,8 +78,8 @@ class LeaseWatch:
     def _lose(self, label: str, servos: set[str], reason: str) -> None:
         present = servos & set(self._rig.names)
         self.leases.block(present, STOPPING)
-        log.warning("lease_lost", client=label, servos=sorted(servos), reason=reason)
         fields = {"client": label, "servos": sorted(servos), "reason": reason}
+        log.warning("lease_lost", **fields)
         self._rig.event_source.publish(Event(EventName.LEASE_LOST, self._loop.time(), fields))
         task = asyncio.create_task(self._stop(present))
         self._stopping.add(task)

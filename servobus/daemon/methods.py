@@ -25,8 +25,6 @@ from servobus.rpc.methods import (
     Names,
     Nothing,
     RigHealth,
-    Subscribe,
-    Unsubscribe,
     needed_role,
 )
 from servobus.values import Health, Role, ScanHit
@@ -116,14 +114,6 @@ def acquire(services: Services, client: Client, params: Names) -> LeaseGrant:
     return _grant(services, services.leases.acquire(client, client.label, services.rig.full_names(params.names)))
 
 
-def renew(services: Services, client: Client, _: Nothing) -> LeaseGrant:
-    return _grant(services, services.leases.renew(client))
-
-
-def release(services: Services, client: Client, params: Names) -> None:
-    services.leases.release(client, services.rig.full_names(params.names))
-
-
 def _grant(services: Services, names: set[str]) -> LeaseGrant:
     return LeaseGrant(tuple(sorted(names)), services.leases.lease_ms)
 
@@ -163,14 +153,6 @@ def config(services: Services, _: Client, __: Nothing) -> Any:
     return {"version": setup.version, "buses": buses}
 
 
-def subscribe(services: Services, client: Client, params: Subscribe) -> int:
-    return services.subscriptions.add(client, params)
-
-
-def unsubscribe(services: Services, client: Client, params: Unsubscribe) -> None:
-    services.subscriptions.remove(client, params.subscription)
-
-
 HANDLERS: dict[str, Handler] = {
     **{verb.name: _verb_handler(verb) for verb in VERBS.values() if verb.door},
     "read": read,
@@ -178,8 +160,8 @@ HANDLERS: dict[str, Handler] = {
     "scan": scan,
     "reload": reload,
     "acquire": acquire,
-    "renew": renew,
-    "release": release,
+    "renew": lambda services, client, _: _grant(services, services.leases.renew(client)),
+    "release": lambda services, client, params: services.leases.release(client, services.rig.full_names(params.names)),
     "hello": hello,
     "names": lambda services, _, __: dict(services.rig.names),
     "snapshot": snapshot,
@@ -188,8 +170,8 @@ HANDLERS: dict[str, Handler] = {
     "stats": lambda services, _, __: services.rig.stats(),
     "config": config,
     "leases": lambda services, _, __: services.leases.holders(),
-    "subscribe": subscribe,
-    "unsubscribe": unsubscribe,
+    "subscribe": lambda services, client, params: services.subscriptions.add(client, params),
+    "unsubscribe": lambda services, client, params: services.subscriptions.remove(client, params.subscription),
 }
 
 

@@ -10,6 +10,7 @@ import asyncio
 import heapq
 import itertools
 from collections.abc import Hashable
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
@@ -41,20 +42,16 @@ class Subscriber(Hashable, Protocol):
     def write(self, data: bytes) -> None: ...
 
 
+@dataclass(eq=False, slots=True)
 class Subscription:
     """`missed` counts the notices that the client did not get."""
 
-    __slots__ = ("client", "due", "fields", "id", "missed", "names", "period", "topic")
-
-    def __init__(self, number: int, client: Subscriber, params: Subscribe, names: tuple[str, ...], due: float) -> None:
-        self.id = number
-        self.client: Subscriber | None = client
-        self.topic = params.topic
-        self.names = names
-        self.fields = params.fields
-        self.period = 1 / params.hz
-        self.due = due
-        self.missed = 0
+    id: int
+    client: Subscriber | None
+    params: Subscribe
+    names: tuple[str, ...]
+    due: float
+    missed: int = 0
 
     def __lt__(self, other: Subscription) -> bool:
         return self.due < other.due
@@ -92,7 +89,7 @@ class Subscriptions:
         due = self._loop.time() + self._phase / params.hz
         added = Subscription(next(self._numbers), client, params, names, due)
         mine[added.id] = added
-        if added.topic != Topic.EVENTS:
+        if added.params.topic != Topic.EVENTS:
             heapq.heappush(self._heap, added)
             self._arm()
         return added.id
@@ -130,8 +127,9 @@ class Subscriptions:
             if subscription.client is None:
                 continue
             late = now - subscription.due
-            steps = max(1.0, late // subscription.period + 1)  # the next point of the grid that has not passed
-            subscription.due += steps * subscription.period
+            period = 1 / subscription.params.hz
+            steps = max(1.0, late // period + 1)  # the next point of the grid that has not passed
+            subscription.due += steps * period
             heapq.heappush(self._heap, subscription)
             self._send(subscription, subscription.client, int(steps) - 1, now)
         self._arm()
@@ -142,18 +140,18 @@ class Subscriptions:
             subscription.missed += 1
             return
         head = b'{"subscription":%d,"missed":%d,' % (subscription.id, subscription.missed)
-        if subscription.topic == Topic.STATS:
+        if subscription.params.topic == Topic.STATS:
             rest = b'"stats":%b}' % encode(self._rig.stats())
         else:
             rest = b'"stopped":%b,"states":%b}' % (encode(self._rig.stopped), self._states(subscription, now))
         subscription.missed = 0
-        client.write(notification(subscription.topic, head + rest))
+        client.write(notification(subscription.params.topic, head + rest))
 
     def _states(self, subscription: Subscription, now: float) -> bytes:
         names = [name for name in subscription.names or self._rig.names if name in self._rig.names]
-        if subscription.fields:
+        if subscription.params.fields:
             states = ((name, self._rig.state(name)) for name in names)
-            return encode({name: {key: getattr(state, key) for key in subscription.fields} for name, state in states})
+            return encode({name: {key: getattr(state, key) for key in subscription.params.fields} for name, state in states})
         if now - self._encoded_at > SAME_MOMENT:
             self._encoded.clear()
             self._encoded_at = now
@@ -168,17 +166,12 @@ class Subscriptions:
     def _event(self, event: Event) -> None:
         for client, mine in self._of.items():
             for subscription in mine.values():
-                if subscription.topic != Topic.EVENTS:
+                if subscription.params.topic != Topic.EVENTS:
                     continue
                 if client.blocked:
                     subscription.missed += 1
                     continue
-                params = {
-                    "subscription": subscription.id,
-                    "missed": subscription.missed,
-                    "name": event.name,
-                    "time": event.time,
-                    "fields": event.fields,
-                }
+                head = {"subscription": subscription.id, "missed": subscription.missed}
+                params = head | {"name": event.name, "time": event.time, "fields": event.fields}
                 subscription.missed = 0
                 client.write(notification("event", encode(params)))

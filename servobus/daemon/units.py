@@ -5,7 +5,6 @@ The unit removes all rights that a daemon on serial lines does not need, but not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 USER = "servobus"
@@ -134,13 +133,9 @@ def write(texts: dict[PurePosixPath, str], root: Path, *, force: bool = False) -
     targets = {root / path.relative_to("/"): text for path, text in texts.items()}
     others = [path for path, text in targets.items() if path.exists() and path.read_text() != text]
     if others and not force:
-        raise FileExistsError(f"{_listing(others)} has other content: look at it, then give --force")
+        raise FileExistsError(f"{', '.join(map(str, others))} has other content: look at it, then give --force")
     for path, text in targets.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
         path.chmod(0o644)
     return list(targets)
-
-
-def _listing(paths: Sequence[Path]) -> str:
-    return ", ".join(map(str, paths))

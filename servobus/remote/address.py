@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import ssl
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from urllib.parse import urlsplit
 from servobus.errors import AccessDenied, ConfigError, LinkDown
 from servobus.remote.connection import DaemonConnection
 from servobus.rpc.socket_path import find_socket, socket_path
+from servobus.values import is_loopback
 
 CONNECT_TIMEOUT = 5.0  # seconds for the connection to open
 MAX_TOKEN = 4096
@@ -64,16 +64,9 @@ def address_of(address: str | Path | None, tls: bool | str | Path | ssl.SSLConte
         raise ConfigError(f"{text}: {error}: write tcp://host:port") from None
     if url.scheme != "tcp" or not host or not port or url.path or url.query or url.username:
         raise ConfigError(f"{text} is no address of a daemon: write the path of its socket, or tcp://host:port")
-    if not tls and not _this_machine(host):
+    if not tls and not is_loopback(host):
         raise ConfigError(f"{text} is another machine, and the token would be readable on the way: give tls=True or its CA file")
     return Address(host=host, port=port, tls=_context(tls) if tls else None)
-
-
-def _this_machine(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _context(tls: bool | str | Path | ssl.SSLContext) -> ssl.SSLContext:

@@ -183,13 +183,12 @@ class RemoteRig(Rig):
 
     async def _call(self, method: str, params: dict[str, Any], then: Callable[[Any], Any] | None = None) -> Any:
         """Call a verb. One that changes states reads them again afterwards, also when it failed for some servos."""
-        refresh = self._refresh if VERBS[method].refreshes else _nothing
         try:
             result = await self._session.call(method, params, then=then)
         except ServobusError:
-            await refresh()
+            await self._refresh_after(method)
             raise
-        await refresh()
+        await self._refresh_after(method)
         return result
 
     # What is known without a turn
@@ -238,9 +237,10 @@ class RemoteRig(Rig):
         with suppress(ServobusError):  # the next notice asks again
             self._cache.names = await self._session.call("names", {})
 
-    async def _refresh(self) -> None:
-        with suppress(ServobusError):  # the verb itself is done
-            await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._store)
+    async def _refresh_after(self, method: str) -> None:
+        if VERBS[method].refreshes:
+            with suppress(ServobusError):  # the verb itself is done
+                await self._session.call("snapshot", {}, timeout=REFRESH_TIMEOUT, then=self._store)
 
     async def watch(self, hz: float = 10.0) -> AsyncIterator[Snapshot]:
         """As `Rig.watch`, with `hz` up to 200. When the connection is lost, a snapshot shows every servo offline."""
@@ -304,18 +304,15 @@ class RemoteRig(Rig):
         await self._leases.release(self.full_names(names))
 
     async def stop(self) -> dict[str, StopReport]:
-        def latched(reports: dict[str, StopReport]) -> dict[str, StopReport]:
-            self._cache.stopped = True
-            return reports
-
-        reports: dict[str, StopReport] = await self._call("stop", {}, latched)
+        reports: dict[str, StopReport] = await self._call("stop", {}, lambda reports: self._latch(True, reports))
         return reports
 
     async def clear(self) -> None:
-        def released(_: None) -> None:
-            self._cache.stopped = False
+        await self._call("clear", {}, lambda _: self._latch(False, None))
 
-        await self._call("clear", {}, released)
+    def _latch(self, stopped: bool, result: T) -> T:
+        self._cache.stopped = stopped
+        return result
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
         full = self.full_names(names)
@@ -372,12 +369,8 @@ class RemoteRig(Rig):
     async def reload(self) -> Reload:
         report: Reload = await self._session.call("reload", {})
         await self._rename()
-        await self._refresh()
+        await self._refresh_after("reload")
         return report
-
-
-async def _nothing() -> None:
-    """Nothing to do."""
 
 
 def _exactly(names: Collection[str], results: dict[str, T]) -> dict[str, T]:

@@ -31,10 +31,11 @@ class WantedSubscription:
     numbers: set[int] = field(default_factory=set)  # the numbers that the present connection gave it
 
 
+@dataclass(eq=False)
 class Session:
     """Keeps one client connected.
 
-    Args:
+    Attributes:
         address: The daemon's address, for messages.
         opener: Opens a connection.
         hello: Returns the parameters of the greeting.
@@ -44,25 +45,17 @@ class Session:
         progress: Called with the parameters of each `progress` notice.
     """
 
-    def __init__(
-        self,
-        address: str,
-        opener: Opener,
-        hello: Callable[[], dict[str, Any]],
-        greeted: Callable[[Greeting], None],
-        prepare: Callable[[DaemonConnection], Awaitable[None]],
-        changed: Callable[[LinkDown | None], None],
-        progress: Callable[[dict[str, Any]], None],
-    ) -> None:
-        self.address = address
-        self._opener = opener
-        self._hello = hello
-        self._greeted = greeted
-        self._prepare = prepare
-        self._changed = changed
-        self._progress = progress
+    address: str
+    opener: Opener
+    hello: Callable[[], dict[str, Any]]
+    greeted: Callable[[Greeting], None]
+    prepare: Callable[[DaemonConnection], Awaitable[None]]
+    changed: Callable[[LinkDown | None], None]
+    progress: Callable[[dict[str, Any]], None]
+
+    def __post_init__(self) -> None:
         self._connection: DaemonConnection | None = None
-        self._down = LinkDown(f"{address}: not connected yet")
+        self._down = LinkDown(f"{self.address}: not connected yet")
         self._subscriptions: dict[WantedSubscription, None] = {}  # in the order they were made
         self._reconnecting: asyncio.Task[None] | None = None
         self._watchdog: asyncio.TimerHandle | None = None
@@ -70,20 +63,20 @@ class Session:
 
     async def connect(self) -> None:
         """The first time, or again. Raises LinkDown, AccessDenied, NotSupported, ConfigError."""
-        hello = self._hello()
-        connection = await self._opener(lambda: DaemonConnection(self.address, self._notice, self._lost))
+        hello = self.hello()
+        connection = await self.opener(lambda: DaemonConnection(self.address, self._notice, self._lost))
         try:
-            self._greeted(await self._greet(connection, hello))
+            self.greeted(await self._greet(connection, hello))
             for subscription in tuple(self._subscriptions):
                 await self._begin(connection, subscription)
-            await self._prepare(connection)
+            await self.prepare(connection)
             if connection.down is not None:
                 raise LinkDown(connection.down.message)
         except BaseException:
             connection.fail("the greeting was not finished")
             raise
         self._connection = connection
-        self._changed(None)
+        self.changed(None)
         self._watch()
 
     async def _greet(self, connection: DaemonConnection, hello: dict[str, Any]) -> Greeting:
@@ -155,7 +148,7 @@ class Session:
         if method == "progress":
             if self._connection is not None:
                 self._connection.extend("scan")
-            self._progress(notice)
+            self.progress(notice)
             return
         for subscription in tuple(self._subscriptions):
             if notice.get("subscription") in subscription.numbers:
@@ -168,7 +161,7 @@ class Session:
             return  # it was not in use yet
         self._connection, self._down = None, error
         if not self._closed:
-            self._changed(error)
+            self.changed(error)
             self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
 
     async def _reconnect(self) -> None:

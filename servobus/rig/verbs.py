@@ -19,21 +19,16 @@ from typing import Any, get_args, get_origin
 from servobus.rig.interface import Rig, Servo
 from servobus.values import Role
 
-DEADLINE = 10.0
-"""Seconds that a client waits for the reply of a verb."""
-SLOW = 30.0
-"""The same for a verb that goes through a whole bus."""
+DEADLINE = 10.0  # seconds that a client waits for the reply of a verb
+SLOW = 30.0  # the same for a verb that goes through a whole bus
 
 
 class LeaseRule(Enum):
     """What a verb demands of the motion leases of its servos."""
 
-    NONE = "none"
-    """Nothing."""
-    FREE = "free"
-    """No other client may hold one."""
-    TAKEN = "taken"
-    """The client takes them, unless another one holds one."""
+    NONE = "none"  # nothing
+    FREE = "free"  # no other client may hold one
+    TAKEN = "taken"  # the client takes them, unless another one holds one
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +36,11 @@ class Verb:
     """One row: a method of `Rig`, or one of `Servo` that takes the servo's name first where there is no `Servo`."""
 
     function: Callable[..., Coroutine[Any, Any, Any]]
-    role: Role
-    """The least role that may call it through a daemon."""
+    role: Role  # the least role that may call it through a daemon
     lease: LeaseRule = LeaseRule.NONE
     deadline: float = DEADLINE
-    refreshes: bool = False
-    """It changes what `snapshot` shows: a remote rig reads that again before the verb returns."""
-    door: bool = True
-    """It is a method of the daemon; False: a client makes it of another verb."""
+    refreshes: bool = False  # it changes what `snapshot` shows: a remote rig reads that again before the verb returns
+    door: bool = True  # it is a method of the daemon; False: a client makes it of another verb
 
     @property
     def name(self) -> str:

@@ -13,16 +13,11 @@ import msgspec
 from servobus.rig.verbs import DEADLINE, VERBS, LeaseRule, Verb, fields, signature
 from servobus.values import Role, State
 
-PROTOCOL = 1
-"""Version of these messages. A client of another version is refused at `hello`."""
-MAX_LINE = 65_536
-"""Bytes of one line, its end included."""
-MAX_DEPTH = 32
-"""Levels of one line."""
-MAX_BATCH = 100
-"""Calls in one array."""
-MAX_SUBSCRIPTIONS = 16
-"""Subscriptions of one connection."""
+PROTOCOL = 1  # version of these messages. A client of another version is refused at `hello`.
+MAX_LINE = 65_536  # bytes of one line, its end included
+MAX_DEPTH = 32  # levels of one line
+MAX_BATCH = 100  # calls in one array
+MAX_SUBSCRIPTIONS = 16  # subscriptions of one connection
 MIN_HZ, MAX_HZ = 0.1, 200.0
 
 
@@ -93,12 +88,9 @@ class RigHealth(msgspec.Struct, frozen=True):
 
     ok: bool
     stopped: bool
-    buses: dict[str, bool]
-    """Whether the line is up."""
-    servos: dict[str, str]
-    """online, doubtful or offline."""
-    faults: dict[str, tuple[str, ...]]
-    """Of the servos that have any."""
+    buses: dict[str, bool]  # whether the line is up
+    servos: dict[str, str]  # online, doubtful or offline
+    faults: dict[str, tuple[str, ...]]  # of the servos that have any
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +100,8 @@ class Method:
     params: type[Params]
     result: Any
     role: Role
-    motion: bool = False
-    """It takes the motion leases of its servos."""
-    deadline: float = DEADLINE
-    """Seconds a client waits for the reply; `scan` from one `progress` notice to the next."""
+    motion: bool = False  # it takes the motion leases of its servos
+    deadline: float = DEADLINE  # seconds a client waits for the reply; `scan` from one `progress` notice to the next
 
 
 def method_of(verb: Verb) -> Method:
