@@ -49,6 +49,5 @@ def _needs_network(path: Path) -> bool:
 
 
 def _command() -> str:
-    """The servobus that is running now."""
     beside = Path(sys.executable).with_name("servobus")
     return str(beside) if beside.exists() else shutil.which("servobus") or f"{sys.executable} -m servobus"

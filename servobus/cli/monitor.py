@@ -32,19 +32,13 @@ def monitor(options: Options, names: tuple[str, ...], hz: float, count: int | No
     """
 
     async def action(context: RigContext) -> None:
-        updates = _updates(hz, count, seconds)
+        updates = min([limit for limit in (count, seconds and math.ceil(seconds * hz)) if limit], default=None)
         if sys.stdout.isatty() and not options.as_json:
             await _show_live(context, names, hz, updates)
         else:
             await _show(context, names, hz, updates, emit if options.as_json else _print_lines)
 
     on_rig(options, action, names)
-
-
-def _updates(hz: float, count: int | None, seconds: float | None) -> int | None:
-    """The number of updates; None: without end."""
-    limits = [limit for limit in (count, seconds and math.ceil(seconds * hz)) if limit]
-    return min(limits, default=None)
 
 
 def _print_lines(snapshot: Mapping[str, State]) -> None:

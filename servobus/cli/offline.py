@@ -41,7 +41,6 @@ def check(config: str, as_json: bool) -> None:
 
 
 def _load_row(name: str, load: Any) -> tuple[object, ...]:
-    """A Bandwidth as a row of `LOAD_COLUMNS`."""
     return (
         name,
         *(round(load.shares.get(kind, 0.0), 1) for kind in ("goals", "feedback", "health")),

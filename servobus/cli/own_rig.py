@@ -55,7 +55,8 @@ async def open_own(
     try:
         with _traced(config, options) as trace:
             async with open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
-                yield RigContext(rig, lambda: _buses_of(config), _on_exit(config))
+                on_exit = {name: config.buses[bus].servos[servo].on_exit for name, (bus, servo) in config.names.items()}
+                yield RigContext(rig, lambda: _buses_of(config), on_exit)
     except PortBusy as error:
         raise await _with_hint(error) from None
     doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]
@@ -65,10 +66,6 @@ async def open_own(
 
 async def _buses_of(config: Config) -> Mapping[str, BusFacts]:
     return {name: BusFacts(bus.protocol, bus.port, bool(bus.poll.rates())) for name, bus in config.buses.items()}
-
-
-def _on_exit(config: Config) -> Mapping[str, str]:
-    return {name: config.buses[bus].servos[servo].on_exit for name, (bus, servo) in config.names.items()}
 
 
 async def _with_hint(error: PortBusy) -> PortBusy:

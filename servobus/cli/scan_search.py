@@ -77,7 +77,6 @@ class Search:
             self.target = targets[self._bus]
 
     def _ranges(self) -> tuple[list[int], list[int]]:
-        """The rates and the ids to try."""
         definition = PROTOCOLS[self.target.protocol]
         return parse_rates(self._rates, definition.baudrates, self._bare), parse_ids(self._ids, definition.scan_ids)
 

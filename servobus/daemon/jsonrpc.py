@@ -129,17 +129,16 @@ def call_of(message: Any) -> Call:
 
 
 def _params(kind: type[Params], values: Any, reply_id: Any) -> Params:
+    fields = kind.__struct_fields__
+    listing = ", ".join(fields) or "none"
     if isinstance(values, list):
-        fields = kind.__struct_fields__
         if len(values) > len(fields):
-            raise Refused(INVALID_PARAMS, f"params: at most {', '.join(fields) or 'none'}", reply_id)
+            raise Refused(INVALID_PARAMS, f"params: at most {listing}", reply_id)
         values = dict(zip(fields, values, strict=False))
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise Refused(
-            INVALID_PARAMS, f"params: {error}; there are {', '.join(kind.__struct_fields__) or 'none'}", reply_id
-        ) from None
+        raise Refused(INVALID_PARAMS, f"params: {error}; there are {listing}", reply_id) from None
 
 
 def success(call_id: Any, result: Any) -> bytes:

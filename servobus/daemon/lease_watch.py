@@ -38,9 +38,9 @@ class LeaseWatch:
     def acquire(self, client: Hashable, label: str, servos: Collection[str]) -> set[str]:
         """Take servos on request, and return all that the client holds. Raises LeaseHeld."""
         self._labels[client] = label
-        self.leases.acquire(client, label, servos, self._loop.time())
+        held = self.leases.acquire(client, label, servos, self._loop.time())
         self._watch()
-        return self.leases.held_by(client)
+        return held
 
     def renew(self, client: Hashable) -> set[str]:
         return self.leases.renew(client, self._loop.time())

@@ -33,10 +33,6 @@ class Leases:
         """Servo -> label of the client that holds it."""
         return {servo: self._holders[client].label for servo, client in self._owner.items()}
 
-    def held_by(self, client: Hashable) -> set[str]:
-        holder = self._holders.get(client)
-        return set(holder.servos) if holder else set()
-
     def check(self, client: Hashable, servos: Iterable[str]) -> None:
         """Refuse servos that another client holds. Raises LeaseHeld."""
         for servo in servos:
@@ -47,14 +43,15 @@ class Leases:
                 label = self._holders[owner].label
                 raise LeaseHeld(f"{label} moves it: wait until it is released; `stop` is always free", servo=servo)
 
-    def acquire(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
-        """Take servos on request, all or none. Raises LeaseHeld."""
+    def acquire(self, client: Hashable, label: str, servos: Collection[str], now: float) -> set[str]:
+        """Take servos on request, all or none, and return all that the client holds. Raises LeaseHeld."""
         self.check(client, servos)
         self._lost.get(client, set()).difference_update(servos)
         holder = self._holders.setdefault(client, _Holder(label, set(), now))
         holder.servos.update(servos)
         holder.expires = now + self.ttl
         self._owner.update(dict.fromkeys(servos, client))
+        return set(holder.servos)
 
     def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
         """Take servos by moving them. Raises LeaseHeld, also for one that this client lost and did not acquire again."""

@@ -87,7 +87,6 @@ async def _log_states(rig: LocalRig, every: float) -> None:
 
 
 def _log_state(rig: LocalRig) -> None:
-    """Log one line for each bus."""
     stats, snapshot = rig.stats(), rig.snapshot()
     for bus, counts in stats.items():
         servos = {name.partition("/")[2]: state for name, state in snapshot.items() if rig.names[name][0] == bus}

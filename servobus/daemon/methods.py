@@ -16,17 +16,7 @@ from servobus.daemon.subscriptions import Subscriber, Subscriptions
 from servobus.errors import AccessDenied, LimitError, NotSupported
 from servobus.rig.local import LocalRig
 from servobus.rig.verbs import VERBS, LeaseRule, Verb, caller, servos
-from servobus.rpc.methods import (
-    METHODS,
-    PROTOCOL,
-    Greeting,
-    Hello,
-    LeaseGrant,
-    Names,
-    Nothing,
-    RigHealth,
-    needed_role,
-)
+from servobus.rpc.methods import METHODS, PROTOCOL, Greeting, Hello, LeaseGrant, Names, Nothing, RigHealth, needed_role
 from servobus.values import Health, Role, ScanHit
 
 MAX_SCAN = 65_536  # ids and rates of one scan

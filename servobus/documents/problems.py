@@ -39,7 +39,8 @@ class Problems:
     def add(self, path: KeyPath, message: str, *, key: bool = False) -> None:
         """Add a problem of the value at `path`, or of its key."""
         mark = self.document.mark(path, key=key)
-        self._problems[mark, f"{dotted(path)}: {message}" if path else message] = None
+        dotted = ".".join(clip(str(part), 40) for part in path)
+        self._problems[mark, f"{dotted}: {message}" if path else message] = None
 
     def raise_any(self) -> None:
         """Raises ConfigError where there are problems."""
@@ -156,10 +157,6 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in getattr(annotation, "__args__", ()) for model in models_in(part)]
-
-
-def dotted(path: KeyPath) -> str:
-    return ".".join(clip(str(part), 40) for part in path)
 
 
 def quote(value: Any) -> str:

@@ -109,20 +109,16 @@ class DaemonConnection(asyncio.Protocol):
             message = _message(line)
             if message.method is not None:
                 self._notice(message.method, message.params)
+            elif message.id is None and message.error is not None:  # an error without a call is about the connection
+                self.fail(f"the daemon ends the connection: {decoded(message.error)}")
             elif message.id is None:
-                self._connection_error(message.error)
+                raise ValueError("neither a reply nor a notice")
             elif not 0 < message.id <= self._last_id:
                 raise ValueError(f"a reply to call {message.id}, which was never made")
             elif message.id in self._calls:  # else its caller has left
                 self._finish(message.id, message)
         except (ValueError, KeyError, TypeError, RecursionError) as error:  # msgspec's own are ValueErrors
             self._reject(line, str(error))
-
-    def _connection_error(self, error: Any) -> None:
-        """An error without a call is about the connection."""
-        if error is None:
-            raise ValueError("neither a reply nor a notice")
-        self.fail(f"the daemon ends the connection: {decoded(error)}")
 
     def _finish(self, number: int, message: _Message) -> None:
         call = self._calls[number]
@@ -146,15 +142,6 @@ class DaemonConnection(asyncio.Protocol):
 
     async def call(self, method: str, params: dict[str, Any], *, timeout: float, then: Callable[[Any], Any] | None = None) -> Any:
         """Call a method and return its result. Raises the error of the reply, LinkDown; ReplyTimeout after `timeout` seconds."""
-        number, reply = self._send(method, params, timeout, then)
-        try:
-            return await reply
-        finally:
-            self._forget(number)
-
-    def _send(
-        self, method: str, params: dict[str, Any], timeout: float, then: Callable[[Any], Any] | None
-    ) -> tuple[int, asyncio.Future[Any]]:
         if self.down is not None:
             raise LinkDown(f"{self.down.message}; nothing was sent")
         full = len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT
@@ -165,7 +152,10 @@ class DaemonConnection(asyncio.Protocol):
         reply = self._loop.create_future()
         self._calls[number] = _PendingCall(method, reply, timeout, self._loop.call_later(timeout, self._overdue, number), then)
         self._transport.write(line)
-        return number, reply
+        try:
+            return await reply
+        finally:
+            self._forget(number)
 
     def notify(self, method: str, params: dict[str, Any]) -> None:
         """Call a method without waiting for a reply."""
