@@ -75,13 +75,10 @@ async def stream(seconds: float, *, as_json: bool) -> int:
 def _print_loads(config: Config) -> None:
     for name, load in line_loads(config).items():
         options = config.buses[name]
-        verdict = "carries that"
-        if load.total > 100:
-            verdict = "cannot carry all of that: newer goals replace older ones, and polls are skipped"
-        echo(
-            f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {GOAL_HZ:g} goals/s each "
-            f"and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line; it {verdict}"
-        )
+        overload = "cannot carry all of that: newer goals replace older ones, and polls are skipped"
+        demand = f"{GOAL_HZ:g} goals/s each and {FEEDBACK_HZ:g} Hz feedback ask {load.total:.0f} % of the line"
+        verdict = "carries that" if load.total <= 100 else overload
+        echo(f"{name}: {len(options.servos)} servos at {options.baudrate} baud, {demand}; it {verdict}")
 
 
 async def _caller(servo: Servo, results: Counter[str], start: float, seconds: float) -> None:

@@ -33,9 +33,8 @@ def check(config: str, as_json: bool) -> None:
     report(as_json, data, LOAD_COLUMNS, [_load_row(name, load) for name, load in loads.items()])
     overloaded = [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]
     if overloaded:
-        raise ConfigError(
-            f"{config}: more than the line carries: {', '.join(overloaded)}; lower poll or goal_rate, or raise the baud rate"
-        )
+        problem = f"more than the line carries: {', '.join(overloaded)}"
+        raise ConfigError(f"{config}: {problem}; lower poll or goal_rate, or raise the baud rate")
     if not as_json:
         echo(f"{config}: ok")
 

@@ -35,10 +35,8 @@ def config_of(options: Options) -> Config:
 
 def _load(path: str | None) -> Config:
     if path is None and not Path(DEFAULT_CONFIG).exists():
-        raise ConfigError(
-            "no daemon runs, and there is no config: give -c CONFIG, set SERVOBUS_CONFIG, or make "
-            f"./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)"
-        )
+        make = f"make ./{DEFAULT_CONFIG} (`servobus scan --yaml` writes one)"
+        raise ConfigError(f"no daemon runs, and there is no config: give -c CONFIG, set SERVOBUS_CONFIG, or {make}")
     return load_config(path or DEFAULT_CONFIG)
 
 

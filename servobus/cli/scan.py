@@ -73,6 +73,5 @@ def _print(options: Options, target: ScanTarget, hits: Sequence[servobus.ScanHit
 
         echo(starter(target, hits), end="")
     else:
-        echo_table(
-            None, COLUMNS, [(hit.id, hit.baudrate, hit.model, hit.product, hit.firmware, hit.note or None) for hit in hits]
-        )
+        rows = [(hit.id, hit.baudrate, hit.model, hit.product, hit.firmware, hit.note or None) for hit in hits]
+        echo_table(None, COLUMNS, rows)

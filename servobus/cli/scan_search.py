@@ -31,10 +31,7 @@ class Search:
     ) -> None:
         self.hits: list[ScanHit] = []
         self.target = ScanTarget(bus or "", "", "")  # complete when a rig was reached; for a bare port from the beginning
-        self._options = options
-        self._bus = bus
-        self._rates = rates
-        self._ids = ids
+        self._options, self._bus, self._rates, self._ids = options, bus, rates, ids
         self._bare = bool(port)
         if port:
             self.target = ScanTarget(BUS, protocol, port)
@@ -87,13 +84,8 @@ def _progress() -> Iterator[Callable[[int, int, int], object]]:
     if not sys.stderr.isatty():
         yield lambda asked, count, hits: None
         return
-    columns = (
-        TextColumn("scanning"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[hits]} found"),
-    )
+    bar_columns = (TextColumn("scanning"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (*bar_columns, TextColumn("{task.fields[hits]} found"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("scan", total=None, hits=0)
         yield lambda asked, count, hits: bar.update(task, completed=asked, total=count, hits=hits)

@@ -118,9 +118,8 @@ def call_of(message: Any) -> Call:
         raise Refused(INVALID_REQUEST, "an id is a string, a number or null")
     reply_id = None if call_id is NO_ID else call_id
     if message.get("jsonrpc") != "2.0" or message.keys() - {"jsonrpc", "method", "params", "id"}:
-        raise Refused(
-            INVALID_REQUEST, 'a call is {"jsonrpc":"2.0","method":...,"params":{...},"id":...} and nothing else', reply_id
-        )
+        form = '{"jsonrpc":"2.0","method":...,"params":{...},"id":...}'
+        raise Refused(INVALID_REQUEST, f"a call is {form} and nothing else", reply_id)
     name = message.get("method")
     method = METHODS.get(name) if isinstance(name, str) else None
     if method is None or not isinstance(name, str):

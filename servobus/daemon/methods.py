@@ -113,9 +113,8 @@ def _grant(services: Services, names: set[str]) -> LeaseGrant:
 
 def hello(services: Services, client: Client, params: Hello) -> Greeting:
     if params.protocol != PROTOCOL:
-        raise NotSupported(
-            f"this daemon speaks protocol {PROTOCOL}, you speak {params.protocol}: use a client of version {__version__}"
-        )
+        spoken = f"this daemon speaks protocol {PROTOCOL}, you speak {params.protocol}"
+        raise NotSupported(f"{spoken}: use a client of version {__version__}")
     client.greet(params)
     rig, role = services.rig, str(client.role)
     return Greeting("servobus", __version__, PROTOCOL, os.getpid(), role, services.leases.lease_ms, dict(rig.names), rig.stopped)
@@ -172,6 +171,5 @@ def require_role(client: Client, method: str, params: Any) -> None:
         return
     if client.role is METHODS["hello"].role:
         raise AccessDenied("say hello first, with the token")
-    raise AccessDenied(
-        f"{method} is for the role {needed}, you are {client.role}: ask who runs the daemon (access: in its config)"
-    )
+    problem = f"{method} is for the role {needed}, you are {client.role}"
+    raise AccessDenied(f"{problem}: ask who runs the daemon (access: in its config)")

@@ -108,13 +108,9 @@ def files(command: str, config: str = CONFIG, *, network: bool = False) -> dict[
         network: The config has a TCP door, or lines that are reached by TCP.
     """
     families = "AF_UNIX AF_INET AF_INET6" if network else "AF_UNIX"
-    unit = UNIT.format(
-        command=_quoted(command),
-        config=_quoted(config),
-        user=USER,
-        families=families,
-        private_network="" if network else "PrivateNetwork=yes\nIPAddressDeny=any\n",
-    )
+    private = "" if network else "PrivateNetwork=yes\nIPAddressDeny=any\n"
+    names = {"command": _quoted(command), "config": _quoted(config), "user": USER}
+    unit = UNIT.format(**names, families=families, private_network=private)
     return {
         PurePosixPath("/etc/systemd/system/servobus.service"): unit,
         PurePosixPath("/etc/udev/rules.d/60-servobus.rules"): UDEV,

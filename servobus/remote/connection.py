@@ -184,9 +184,8 @@ class DaemonConnection(asyncio.Protocol):
     def _overdue(self, number: int) -> None:
         call = self._calls[number]
         if not call.reply.done():
-            call.reply.set_exception(
-                ReplyTimeout(f"the daemon did not answer {call.method} within {call.timeout:g} s: it may have been applied")
-            )
+            message = f"the daemon did not answer {call.method} within {call.timeout:g} s: it may have been applied"
+            call.reply.set_exception(ReplyTimeout(message))
 
     def _forget(self, number: int) -> None:
         call = self._calls.pop(number, None)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import abc
 import asyncio
-import functools
 import ssl
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, replace
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import msgspec
 
@@ -90,7 +90,7 @@ async def connect(
 def _forward(verb: Verb) -> Callable[..., Coroutine[Any, Any, Any]]:
     """The verb as a call of the daemon."""
 
-    @functools.wraps(verb.function)
+    @wraps(verb.function)
     async def call(self: RemoteRig, *args: Any, **kwargs: Any) -> Any:
         params = arguments(verb, args, kwargs)
         if "names" in params:
@@ -276,10 +276,7 @@ class RemoteRig(Rig):
         if not checked:
             return {}
         params = {"goals": {name: asdict(goal) for name, goal in checked.items()}, "together": together, "confirm": confirm}
-        outcomes: dict[str, Outcome] = await self._leases.move(
-            "send_all", checked, params, lambda outcomes: _exactly(checked, outcomes)
-        )
-        return outcomes
+        return cast("dict[str, Outcome]", await self._leases.move("send_all", checked, params, partial(_exactly, checked)))
 
     def _checked(self, name: str, goal: Goal) -> Goal:
         """The goal with plain numbers. What is not a finite number is refused here, because JSON cannot carry it."""
@@ -304,11 +301,10 @@ class RemoteRig(Rig):
         await self._leases.release(self.full_names(names))
 
     async def stop(self) -> dict[str, StopReport]:
-        reports: dict[str, StopReport] = await self._call("stop", {}, lambda reports: self._latch(True, reports))
-        return reports
+        return cast("dict[str, StopReport]", await self._call("stop", {}, partial(self._latch, True)))
 
     async def clear(self) -> None:
-        await self._call("clear", {}, lambda _: self._latch(False, None))
+        await self._call("clear", {}, partial(self._latch, False))
 
     def _latch(self, stopped: bool, result: T) -> T:
         self._cache.stopped = stopped
@@ -325,8 +321,7 @@ class RemoteRig(Rig):
     async def read(self, name: str, *, max_age: float | None = None) -> State:
         full = self.full_name(name)
         params = {"name": full, "max_age": _bounded(max_age)}
-        state: State = await self._session.call("read", params, then=lambda state: self._store({full: state})[full])
-        return state
+        return cast("State", await self._session.call("read", params, then=lambda state: self._store({full: state})[full]))
 
     async def write_register(self, name: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Any:
         full = self.full_name(name)

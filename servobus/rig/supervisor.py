@@ -93,9 +93,8 @@ class BusSupervisor:
         """Apply the exit policies, parking first. Returns what was done to each servo, by full name."""
         motion = self.bus.motion
         motion.leaving = True
-        left = {
-            record.name: StopReport(record.options.on_exit, False, False, "no answer in time") for record in motion.to_leave()
-        }
+        silent = "no answer in time"
+        left = {record.name: StopReport(record.options.on_exit, False, False, silent) for record in motion.to_leave()}
         parking = [] if motion.latched else self.enabled("on_exit", "park")  # what the e-stop holds stays where it is
         reports = await asyncio.gather(*map(self.park, parking))
         left.update({record.name: report for record, report in zip(parking, reports, strict=True)})

@@ -66,10 +66,8 @@ def decoded(error: Any) -> Exception:
     kind = _kind(data["type"], tuple(also[:8]) if isinstance(also, list) and all(isinstance(name, str) for name in also) else ())
     where: dict[str, Any] = {key: str(data[key]) for key in ("bus", "servo") if data.get(key)} | {"raw": _bytes(data.get("raw"))}
     if issubclass(kind, PartialFailure):
-        results = data.get("results")
-        return PartialFailure(
-            {name: _unresult(one) for name, one in results.items()} if isinstance(results, dict) else {}, **where
-        )
+        results = data["results"] if isinstance(data.get("results"), dict) else {}
+        return PartialFailure({name: _unresult(one) for name, one in results.items()}, **where)
     text = str(data.get("message", message))
     if issubclass(kind, DeviceError):
         number = data.get("code")
