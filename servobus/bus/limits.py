@@ -16,8 +16,10 @@ GOAL_DETAILS = GOAL_NUMBERS[1:]
 
 
 def check_goal(name: str, goal: Goal, options: ServoOptions, setpoint: float | None) -> Goal:
-    """The goal to send: the same, or clamped where the servo says so. `setpoint` is the last position asked for or seen.
-    Raises LimitError."""
+    """Return the goal to send: the same object, or a copy that is clamped where the servo's options say so.
+
+    `setpoint` is the last position that was asked for or read. Raises LimitError.
+    """
     if not is_number(goal.value):
         raise LimitError(no_number("value", goal.value), servo=name)
     plain = goal.speed is goal.duration is goal.acceleration is goal.effort is goal.start_within is None

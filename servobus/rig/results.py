@@ -13,7 +13,10 @@ from servobus.values import Outcome
 
 
 async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, Outcome]:
-    """The outcomes of all, by name. Raises as `raise_failures`."""
+    """Wait for all futures and return their outcomes by name. Raises as `raise_failures`.
+
+    A caller that is cancelled cancels every goal that still waits.
+    """
     done: dict[str, Outcome] = {}
     failures: dict[str, Exception] = {}
     try:
@@ -32,7 +35,7 @@ async def outcomes(futures: Mapping[str, asyncio.Future[Outcome]]) -> dict[str, 
 
 
 def _abandon(futures: Iterable[asyncio.Future[Outcome]]) -> None:
-    """Cancel what has not ended; an error that nobody receives any more is not reported as forgotten."""
+    """Cancel the futures that have not ended, and mark the errors of the others as received."""
     for future in futures:
         if not future.cancel() and not future.cancelled():
             future.exception()

@@ -42,7 +42,9 @@ class GoalWriter:
         packer = self.packers.get(goal.servo)
         if packer is None:
             raise UnknownName(f"no servo {goal.servo} on this bus")
-        return packer.pack(goal if goal.start is not None else ServoGoal(goal.servo, goal.goal, goal.goal.value))
+        if goal.start is None:
+            goal = ServoGoal(goal.servo, goal.goal, goal.goal.value)
+        return packer.pack(goal)
 
     def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> list[GoalPlan]:
         """Return the fewest plans that carry these goals."""
@@ -86,12 +88,10 @@ class GoalWriter:
     def _write_frame(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
         request = self._frame(parts)
         yield request
-        outcome = Outcome.ACKED if request.replies else Outcome.SENT
-        results: Results = {}
         for part in parts:
-            part.servo.hold(part.settings)
-            results[part.servo.name] = outcome
-        return results
+            if part.settings:
+                part.servo.hold(part.settings)
+        return dict.fromkeys(_names(parts), Outcome.ACKED if request.replies else Outcome.SENT)
 
     # REG WRITE and ACTION
 
