@@ -20,7 +20,7 @@ def test_no_attribute_of_an_error_can_be_set(name: str) -> None:
     assert str(error) == "arm: too far"
 
 
-def test_a_place_is_added_by_making_a_new_error() -> None:
+def test_at_makes_a_new_error() -> None:
     error = DeviceError("overload", code=32, servo="elbow", raw=b"\x20")
     located = error.at(bus="arm", servo="wrist")
     assert (error.bus, located.bus, located.servo) == (None, "arm", "elbow"), "what is known stays"

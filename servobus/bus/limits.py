@@ -83,5 +83,5 @@ def _within(
     return min(max(value, limits[0]), limits[1])
 
 
-def _symmetric(greatest: float | None) -> tuple[float, float] | None:
-    return None if greatest is None else (-greatest, greatest)
+def _symmetric(limit: float | None) -> tuple[float, float] | None:
+    return None if limit is None else (-limit, limit)

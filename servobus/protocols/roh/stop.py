@@ -97,8 +97,8 @@ def _write_unanswered(hand: Hand, targets: Targets) -> Plan[dict[str, StopReport
         for value in group:
             value.finger.held.before_write(value.name, value.raw)
         for _ in range(REPEATS):
-            words = [model.named(value.name).to_word(value.raw) for value in group]
-            yield from ask(UnansweredWrite(hand.timing, hand.unit, span.start, words))
+            registers = [model.named(value.name).to_word(value.raw) for value in group]
+            yield from ask(UnansweredWrite(hand.timing, hand.unit, span.start, registers))
     written = {value.finger for value in by_address.values()}
     return {
         finger.name: StopReport(
