@@ -131,8 +131,7 @@ class Calibration:
         return self.direction * rate / self.unit_per_step
 
 
-Update: TypeAlias = dict[str, Any]
-"""Fields of `State` that one reply brought."""
+Update: TypeAlias = dict[str, Any]  # fields of `State` that one reply brought
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,8 +242,7 @@ class ServoGoal:
 
     servo: str
     goal: Goal
-    start: float | None = None
-    """The last known position, for a duration that has to become a speed."""
+    start: float | None = None  # the last known position, for a duration that has to become a speed
     packed: Any = field(default=None, compare=False, repr=False)
     """What `Driver.check_goal` returned for this goal, so that it is not packed twice; None: it was not checked yet."""
 
@@ -255,14 +253,10 @@ class StopTarget:
 
     servo: str
     kind: Literal["hold", "limp"]
-    enabled: bool
-    """Enabled by us; one that is not is asked whether its torque is on before it is held."""
-    position: float | None = None
-    """The present position, if it is fresh enough to be written at once."""
-    setpoint: float | None = None
-    """The last position that was sent or held; None: not known."""
-    reachable: bool = True
-    """False: known to be offline; it is written to, and not waited for."""
+    enabled: bool  # enabled by us; one that is not is asked whether its torque is on before it is held
+    position: float | None = None  # the present position, if it is fresh enough to be written at once
+    setpoint: float | None = None  # the last position that was sent or held; None: not known
+    reachable: bool = True  # False: known to be offline; it is written to, and not waited for
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,14 +304,10 @@ class Change:
 class Role(IntEnum):
     """What a client of a daemon may do; each role includes the lower ones."""
 
-    NOBODY = 0
-    """It has not shown a token yet."""
-    OBSERVER = 1
-    """It reads, and it stops: anyone may stop."""
-    OPERATOR = 2
-    """It moves servos."""
-    ADMIN = 3
-    """It changes what is kept: ids, rates, EEPROM, the config."""
+    NOBODY = 0  # it has not shown a token yet
+    OBSERVER = 1  # it reads, and it stops: anyone may stop
+    OPERATOR = 2  # it moves servos
+    ADMIN = 3  # it changes what is kept: ids, rates, EEPROM, the config
 
     def __str__(self) -> str:
         return self.name.lower()

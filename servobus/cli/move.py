@@ -15,7 +15,6 @@ from servobus.cli.output import echo, emit, report
 from servobus.errors import LimitError, NotSupported
 
 TARGET = "NAME=POSITION"
-NOT_LATCHED = "not latched: no daemon runs, so the next command may move again"
 THEN = {
     "stays": "stays enabled",
     "hold": "holds (on_exit)",
@@ -143,7 +142,7 @@ def stop(options: Options) -> int:
     async def action(context: RigContext) -> int:
         reports = await context.rig.stop()
         if not context.has_daemon:
-            echo(NOT_LATCHED, err=True)
+            echo("not latched: no daemon runs, so the next command may move again", err=True)
         rows = [(name, each.action, each.written, each.confirmed, each.detail or None) for name, each in reports.items()]
         report(options.as_json, reports, ("servo", "action", "written", "confirmed", "detail"), rows)
         return 0 if all(each.confirmed for each in reports.values()) else 1

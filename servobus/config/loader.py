@@ -35,8 +35,7 @@ class Config:
 
     version: int
     buses: Mapping[str, BusOptions]
-    models: Mapping[str, Mapping[str, ServoModel]]
-    """Bus -> model name -> model."""
+    models: Mapping[str, Mapping[str, ServoModel]]  # bus -> model name -> model
     access: AccessOptions = field(default_factory=AccessOptions)
     door: DoorOptions = field(default_factory=DoorOptions)
 

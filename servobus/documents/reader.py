@@ -19,18 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
-from ruamel.yaml import YAML
+from ruamel.yaml import YAML, events
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import (
-    AliasEvent,
-    CollectionStartEvent,
-    Event,
-    MappingEndEvent,
-    MappingStartEvent,
-    NodeEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-)
 
 from servobus.errors import ConfigError
 
@@ -99,9 +89,8 @@ def parse(text: str | bytes, name: str) -> Document:
     name = clip(name, 200)
     text = _decode(text, name)
     _scan(text, name)
-    events = YAML(typ="safe", pure=True).parse(text)
-    with closing(events):
-        return _Builder(name, events).document()
+    with closing(YAML(typ="safe", pure=True).parse(text)) as parser:
+        return _Builder(name, parser).document()
 
 
 def clip(text: str, length: int = MAX_SHOWN) -> str:
@@ -118,7 +107,7 @@ def _mark_at(text: str, index: int) -> Mark:
     return text.count("\n", 0, index) + 1, index - (text.rfind("\n", 0, index) + 1) + 1
 
 
-def _start(event: Event) -> Mark:
+def _start(event: events.Event) -> Mark:
     return event.start_mark.line + 1, event.start_mark.column + 1
 
 
@@ -175,9 +164,9 @@ def _scan_brackets(text: str, name: str) -> None:
 class _Builder:
     """Makes data from the parser's events, and refuses the first event that a config cannot contain."""
 
-    def __init__(self, name: str, events: Generator[Any, None, None]) -> None:
+    def __init__(self, name: str, parser: Generator[Any, None, None]) -> None:
         self.name = name
-        self.events = events
+        self.parser = parser
         self.marks: dict[KeyPath, tuple[Mark, Mark]] = {}
         self.nodes = 0
         self.last: Mark = (1, 1)
@@ -186,14 +175,14 @@ class _Builder:
         self.marks[()] = ((1, 1), (1, 1))
         data = None
         while (event := self._next()) is not None:
-            if isinstance(event, NodeEvent):
+            if isinstance(event, events.NodeEvent):
                 data = self._node(event, (), 1)
         return Document(data, self.name, self.marks)
 
-    def _next(self) -> Event | None:
+    def _next(self) -> events.Event | None:
         """The next event. Raises ConfigError for an error of the parser."""
         try:
-            event: Event | None = next(self.events, None)
+            event: events.Event | None = next(self.parser, None)
         except MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             start = (mark.line + 1, mark.column + 1) if mark else self.last
@@ -205,34 +194,34 @@ class _Builder:
             self.last = _start(event)
         return event
 
-    def _refuse(self, event: Event, message: str) -> NoReturn:
+    def _refuse(self, event: events.Event, message: str) -> NoReturn:
         _fail(self.name, _start(event), message)
 
-    def _node(self, event: Event, path: KeyPath, depth: int) -> Any:
+    def _node(self, event: events.Event, path: KeyPath, depth: int) -> Any:
         self._check(event, depth)
-        if isinstance(event, ScalarEvent):
+        if isinstance(event, events.ScalarEvent):
             return self._scalar(event)
-        if isinstance(event, MappingStartEvent):
+        if isinstance(event, events.MappingStartEvent):
             return self._mapping(path, depth)
         return self._sequence(path, depth)
 
-    def _check(self, event: Event, depth: int) -> None:
+    def _check(self, event: events.Event, depth: int) -> None:
         self.nodes += 1
         if self.nodes > MAX_NODES:
             self._refuse(event, f"found more than {MAX_NODES} keys and values; split the file")
-        if isinstance(event, AliasEvent):
+        if isinstance(event, events.AliasEvent):
             self._refuse(event, "found an alias (*name); write the value out")
-        assert isinstance(event, (ScalarEvent, CollectionStartEvent)), "there are no other nodes"
+        assert isinstance(event, (events.ScalarEvent, events.CollectionStartEvent)), "there are no other nodes"
         if event.anchor is not None:
             self._refuse(event, "found an anchor (&name); take it out and write the value where it is needed")
         if event.tag is not None:
             self._refuse(event, "found a tag (!name); take it out, a value shows its type itself")
-        if isinstance(event, CollectionStartEvent) and depth > MAX_DEPTH:
+        if isinstance(event, events.CollectionStartEvent) and depth > MAX_DEPTH:
             self._refuse(event, TOO_DEEP)
 
     def _sequence(self, path: KeyPath, depth: int) -> list[Any]:
         items: list[Any] = []
-        while (event := self._next()) is not None and not isinstance(event, SequenceEndEvent):
+        while (event := self._next()) is not None and not isinstance(event, events.SequenceEndEvent):
             here = (*path, len(items))
             self.marks[here] = (_start(event), _start(event))
             items.append(self._node(event, here, depth + 1))
@@ -240,7 +229,7 @@ class _Builder:
 
     def _mapping(self, path: KeyPath, depth: int) -> dict[str | int, Any]:
         data: dict[str | int, Any] = {}
-        while (event := self._next()) is not None and not isinstance(event, MappingEndEvent):
+        while (event := self._next()) is not None and not isinstance(event, events.MappingEndEvent):
             self._check(event, depth)
             key = self._key(event)
             here = (*path, key)
@@ -253,8 +242,8 @@ class _Builder:
             data[key] = self._node(value, here, depth + 1)
         return data
 
-    def _key(self, event: Event) -> str | int:
-        if not isinstance(event, ScalarEvent):
+    def _key(self, event: events.Event) -> str | int:
+        if not isinstance(event, events.ScalarEvent):
             self._refuse(event, "found a list or a mapping as a key; a key is a word or an integer")
         if event.style is None and event.value == "<<":
             self._refuse(event, "found a merge key (<<); write the keys out")
@@ -263,7 +252,7 @@ class _Builder:
             self._refuse(event, f"found {clip(event.value) or 'nothing'} as a key; use a word or an integer, or put it in quotes")
         return key
 
-    def _scalar(self, event: ScalarEvent) -> Any:
+    def _scalar(self, event: events.ScalarEvent) -> Any:
         text: str = event.value
         if event.style is not None:
             if match := FORBIDDEN.search(text):
@@ -277,7 +266,7 @@ class _Builder:
             self._refuse(event, f"found {clip(text)}; write a finite number, or put it in quotes if it is text")
         return float(text) if FLOAT.fullmatch(text) else text
 
-    def _integer(self, event: Event, text: str) -> int:
+    def _integer(self, event: events.Event, text: str) -> int:
         if LEADING_ZERO.fullmatch(text):
             self._refuse(event, f"found the leading zero of {clip(text)}; take it out, or put it in quotes if it is text")
         number = int(text, 0) if len(text) <= 25 else MAX_INTEGER + 1
