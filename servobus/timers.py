@@ -111,10 +111,15 @@ class CoarseTimer:
         """At `when` (seconds of `clock_of`) at the latest."""
         if self.at <= when:
             return
-        if self._handle is not None:
-            self._handle.cancel()
+        self.cancel()
         self.at = when
         self._handle = self._loop.call_later(max(0.0, when - self._clock()), self._fire)
+
+    def cancel(self) -> None:
+        """Not at all."""
+        self.at = math.inf
+        if self._handle is not None:
+            self._handle.cancel()
 
     def _fire(self) -> None:
         self._handle = None

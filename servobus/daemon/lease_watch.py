@@ -9,6 +9,7 @@ from servobus.daemon.leases import Leases
 from servobus.rig.events import Event
 from servobus.rig.local import LocalRig
 from servobus.rig.logs import EventLogger
+from servobus.timers import CoarseTimer
 from servobus.values import EventName
 
 log = EventLogger("servobus.daemon")
@@ -24,8 +25,7 @@ class LeaseWatch:
         self.holders, self.check, self.release = self.leases.holders, self.leases.check, self.leases.release
         self._rig = rig
         self._loop = asyncio.get_running_loop()
-        self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0
+        self._timer = CoarseTimer(self._loop, self._expire)
         self._labels: dict[Hashable, str] = {}
         self._stopping: set[asyncio.Task[None]] = set()
 
@@ -57,20 +57,15 @@ class LeaseWatch:
         self.leases.forget(set(self.leases.holders()) - set(self._rig.names))
 
     async def close(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+        self._timer.cancel()
         await asyncio.gather(*self._stopping)
 
     def _watch(self) -> None:
         expiry = self.leases.next_expiry()
-        if expiry is not None and (self._timer is None or self._timer_at > expiry):
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer_at = expiry
-            self._timer = self._loop.call_at(expiry, self._expire)
+        if expiry is not None:
+            self._timer.by(expiry)
 
     def _expire(self) -> None:
-        self._timer = None
         for client, servos in self.leases.expire(self._loop.time()).items():
             self._lose(self._labels.get(client, ""), servos, "it did not renew its lease in time")
         self._watch()

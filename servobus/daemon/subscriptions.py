@@ -19,6 +19,7 @@ from servobus.errors import NotSupported, Overloaded, UnknownName
 from servobus.rig.events import Event
 from servobus.rig.local import LocalRig
 from servobus.rpc.methods import MAX_HZ, MAX_SUBSCRIPTIONS, MIN_HZ, Subscribe
+from servobus.timers import CoarseTimer
 from servobus.values import State
 
 
@@ -67,8 +68,7 @@ class Subscriptions:
         self._phase = 0.0
         self._heap: list[Subscription] = []
         self._of: dict[Subscriber, dict[int, Subscription]] = {}
-        self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # kept here: a timer of uvloop that is due already does not say when
+        self._timer = CoarseTimer(self._loop, self._tick)
         self._encoded: dict[str, bytes] = {}
         self._encoded_at = -1.0
         self._unlisten = rig.event_source.subscribe(self._event)
@@ -107,18 +107,13 @@ class Subscriptions:
 
     def close(self) -> None:
         self._unlisten()
-        if self._timer is not None:
-            self._timer.cancel()
+        self._timer.cancel()
 
     def _arm(self) -> None:
-        if self._heap and (self._timer is None or self._timer_at > self._heap[0].due):
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer_at = self._heap[0].due
-            self._timer = self._loop.call_at(self._timer_at, self._tick)
+        if self._heap:
+            self._timer.by(self._heap[0].due)
 
     def _tick(self) -> None:
-        self._timer = None
         now = self._loop.time()
         for _ in range(SHARE):
             if not self._heap or self._heap[0].due > now:
