@@ -339,7 +339,7 @@ def no_number(what: str, value: object) -> str:
     return f"{what}: {'a huge integer' if huge else repr(value)[:40]} is not a finite number"
 
 
-def known_command(commands: Mapping[str, str], name: str) -> str:
+def check_command(commands: Mapping[str, str], name: str) -> str:
     """What the command does. Raises UnknownName, which lists the commands."""
     if name not in commands:
         raise UnknownName(f"no command {name!r}: there are {', '.join(f'{each} ({what})' for each, what in commands.items())}")

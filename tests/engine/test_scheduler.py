@@ -227,63 +227,75 @@ def test_a_lost_line_ends_everything() -> None:
 # Everything at once
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) -> None:
-    rng, now, limit, nodes = random.Random(seed), 0.0, 8, (1, 2, 3, 4)
-    bench, jobs = Bench(*nodes, limit=limit, goals_per_frame=2), list[Job]()
-    accepted, ended = Counter[str](), Ended()
-    bench.scheduler.set_polls([poll("feedback", 200, *nodes)], now)
+class RandomCalls:
+    """A scheduler, and random things that happen to it."""
 
-    def submit() -> None:
+    def __init__(self, seed: int) -> None:
+        self.rng, self.now, self.limit, self.nodes = random.Random(seed), 0.0, 8, (1, 2, 3, 4)
+        self.bench, self.jobs = Bench(*self.nodes, limit=self.limit, goals_per_frame=2), list[Job]()
+        self.accepted, self.ended = Counter[str](), Ended()
+        self.bench.scheduler.set_polls([poll("feedback", 200, *self.nodes)], self.now)
+
+    def step(self) -> None:
+        calls = (self.submit, self.put, self.turn, self.node, self.drop)
+        self.rng.choices(calls, (30, 30, 40, 5, 2))[0]()
+        self.now += self.rng.choice((0.0, 0.001, 0.005))
+
+    def submit(self) -> None:
         new = job(
-            rng.choice(nodes),
-            expires=now + rng.uniform(0.01, 0.1),
-            kind=JobKind.MOTION if rng.random() < 0.2 else JobKind.ORDINARY,
+            self.rng.choice(self.nodes),
+            expires=self.now + self.rng.uniform(0.01, 0.1),
+            kind=JobKind.MOTION if self.rng.random() < 0.2 else JobKind.ORDINARY,
         )
         try:
-            bench.scheduler.queue(new, now)
+            self.bench.scheduler.queue(new, self.now)
         except Overloaded:
             return
-        jobs.append(new)
+        self.jobs.append(new)
 
-    def put() -> None:
-        number = rng.choice(nodes)
-        accepted[f"s{number}"] += 1
-        bench.coalescer.put(ticket(number, ended, expires=now + rng.uniform(0.001, 0.05), batch=rng.choice((None, None, 1, 2))))
+    def put(self) -> None:
+        number = self.rng.choice(self.nodes)
+        self.accepted[f"s{number}"] += 1
+        expires, batch = self.now + self.rng.uniform(0.001, 0.05), self.rng.choice((None, None, 1, 2))
+        self.bench.coalescer.put(ticket(number, self.ended, expires=expires, batch=batch))
 
-    def turn() -> None:
-        taken = bench.scheduler.next_job(now)
+    def turn(self) -> None:
+        taken = self.bench.scheduler.next_job(self.now)
         if taken is None:
-            bench.scheduler.expire(now)
-        elif rng.random() < 0.1:
+            self.bench.scheduler.expire(self.now)
+        elif self.rng.random() < 0.1:
             taken.fail(ReplyTimeout("no answer"))
         elif taken.plan is not None:
             finish(taken)
-        elif rng.random() < 0.1:
-            bench.scheduler.retry(taken)
+        elif self.rng.random() < 0.1:
+            self.bench.scheduler.retry(taken)
         else:
             taken.succeed({})
 
-    def node() -> None:
-        changed = bench.node(rng.choice(nodes))
-        if rng.random() < 0.5:
-            bench.nodes.missed(changed, READ | ANSWER, now, now)
+    def node(self) -> None:
+        changed = self.bench.node(self.rng.choice(self.nodes))
+        if self.rng.random() < 0.5:
+            self.bench.nodes.missed(changed, READ | ANSWER, self.now, self.now)
         else:
-            bench.nodes.fenced(changed)
+            self.bench.nodes.fenced(changed)
 
-    def drop() -> None:
-        if rng.random() < 0.05:
-            bench.scheduler.drop(estopped, motion_only=rng.random() < 0.8)
+    def drop(self) -> None:
+        if self.rng.random() < 0.05:
+            self.bench.scheduler.drop(estopped, motion_only=self.rng.random() < 0.8)
         else:
-            bench.scheduler.drop_goals(disabled, {f"s{rng.choice(nodes)}"})
+            self.bench.scheduler.drop_goals(disabled, {f"s{self.rng.choice(self.nodes)}"})
 
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_happens_each_job_and_each_goal_ends_exactly_once(seed: int) -> None:
+    calls = RandomCalls(seed)
+    scheduler, coalescer = calls.bench.scheduler, calls.bench.coalescer
     for _ in range(1000):
-        rng.choices((submit, put, turn, node, drop), (30, 30, 40, 5, 2))[0]()
-        now += rng.choice((0.0, 0.001, 0.005))
-        assert 0 <= len(bench.scheduler.requests) <= 3 * limit
-        assert 0 <= len(bench.coalescer) <= len(nodes)
-    bench.scheduler.drop(estopped, motion_only=False)
-    assert bench.scheduler.waiting() == 0
-    assert Counter(servo for servo, _ in ended) == accepted
-    assert [len(results(each)) for each in jobs] == [1] * len(jobs)
-    assert len(jobs) > 100
+        calls.step()
+        assert 0 <= len(scheduler.requests) <= 3 * calls.limit
+        assert 0 <= len(coalescer) <= len(calls.nodes)
+    scheduler.drop(estopped, motion_only=False)
+    assert scheduler.waiting() == 0
+    assert Counter(servo for servo, _ in calls.ended) == calls.accepted
+    assert [len(results(each)) for each in calls.jobs] == [1] * len(calls.jobs)
+    assert len(calls.jobs) > 100

@@ -19,7 +19,7 @@ from servobus.protocols.kst.codec import SAVE_DATA, Command
 from servobus.protocols.kst.identity import observe
 from servobus.protocols.kst.options import KstBus
 from servobus.protocols.kst.requests import Read, RequestSettings, Save, SetValue, UnansweredCommand
-from servobus.values import Change, known_command
+from servobus.values import Change, check_command
 
 DOUBTFUL_ID = 0xFF
 """The document allows it as an address, but an idle line reads as 0xFF."""
@@ -59,7 +59,7 @@ class KstCommissioning(Commissioning):
         return self._change(Change(node, "baudrate", baudrate), Command.SET_BAUD, codes[0], save)
 
     def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
-        known_command(self.commands, name)
+        check_command(self.commands, name)
         if value is not None:
             raise LimitError(f"{name} takes no value: nothing was sent")
         return self.save(node)

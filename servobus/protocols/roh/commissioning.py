@@ -15,7 +15,7 @@ from servobus.protocols.base import Commissioning, Plan, ask
 from servobus.protocols.modbus.codec import MAX_UNIT
 from servobus.protocols.modbus.requests import ReadHolding
 from servobus.protocols.roh.hand import Hand
-from servobus.values import Change, known_command
+from servobus.values import Change, check_command
 
 RESTART_PATIENCE = 1.7
 """Seconds the first request after a restart may take. It is tried three times, which makes the 5 s that a restart may take."""
@@ -85,7 +85,7 @@ class RohCommissioning(Commissioning):
         return Change(hand.unit, "id", new, saved=True, pending_reboot=False)
 
     def command(self, node: int, name: str, value: int | None = None) -> Plan[tuple[str, ...]]:
-        known_command(self.commands, name)
+        check_command(self.commands, name)
         command = COMMANDS[name]
         number = command.value if value is None else value
         if (value is None) is (command.value is None) or number is None or not 0 <= number <= 0xFFFF:
