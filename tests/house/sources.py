@@ -7,7 +7,7 @@ import gc
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PRODUCT = sorted((ROOT / "servobus").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
