@@ -31,8 +31,7 @@ def check(config: str, as_json: bool) -> None:
     loads = line_loads(load_config(config))
     data = {name: _load_as_dict(load) for name, load in loads.items()}
     report(as_json, data, LOAD_COLUMNS, [_load_row(name, load) for name, load in loads.items()])
-    overloaded = [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]
-    if overloaded:
+    if overloaded := [f"{name} ({load.total:.0f} %)" for name, load in loads.items() if load.total > 100]:
         problem = f"more than the line carries: {', '.join(overloaded)}"
         raise ConfigError(f"{config}: {problem}; lower poll or goal_rate, or raise the baud rate")
     if not as_json:

@@ -57,8 +57,7 @@ async def open_own(
                 yield RigContext(rig, lambda: _buses_of(config), on_exit)
     except PortBusy as error:
         raise await _with_hint(error) from None
-    doubtful = [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]
-    if doubtful:
+    if doubtful := [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]:
         raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; check the servo before you touch it")
 
 

@@ -140,8 +140,7 @@ class ClientConnection(asyncio.Protocol):
             return
         allowed = set(URGENT)  # one of each in what came together goes ahead; a flood of them waits like any other call
         for line in lines:
-            methods = urgent(line) & allowed
-            if methods:
+            if methods := urgent(line) & allowed:
                 allowed -= methods
                 self._do(line)
             elif line.strip():
@@ -174,8 +173,7 @@ class ClientConnection(asyncio.Protocol):
         if self._paused and self._waiting <= MAX_WAITING // 2 and not self._closed:
             self._paused = False
             self._transport.resume_reading()
-        wait = self._bucket.take(self.door.now())
-        if wait:
+        if wait := self._bucket.take(self.door.now()):
             self.door.loop.call_later(wait, self._go_on)  # it stays scheduled, so that nothing else handles its next line
             return False
         self._scheduled = bool(self._lines) and not (self.blocked or len(self._tasks) >= MAX_TASKS)

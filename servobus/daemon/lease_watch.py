@@ -83,8 +83,7 @@ class LeaseWatch:
     async def _stop(self, servos: set[str]) -> None:
         try:
             reports = await self._rig.abandon(servos)
-            doubtful = {name: report.detail for name, report in reports.items() if not report.confirmed}
-            if doubtful:
+            if doubtful := {name: report.detail for name, report in reports.items() if not report.confirmed}:
                 log.warning("lost_client_unconfirmed", servos=doubtful)
         finally:
             self.leases.unblock(servos)

@@ -55,8 +55,7 @@ class Leases:
 
     def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
         """Take servos by moving them. Raises LeaseHeld, also for one that this client lost and did not acquire again."""
-        lost = self._lost.get(client, set()).intersection(servos)
-        if lost:
+        if lost := self._lost.get(client, set()).intersection(servos):
             raise LeaseHeld("its motion lease has expired, so this may be an old motion: acquire it again", servo=sorted(lost)[0])
         self.acquire(client, label, servos, now)
 

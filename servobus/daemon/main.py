@@ -65,8 +65,7 @@ async def _feed(rig: LocalRig, notifier: Notifier, period: float) -> None:
     """Feed the system's watchdog as long as every bus makes progress."""
     watchdog = Watchdog()
     while True:
-        stuck = watchdog.stuck({name: _pulse(rig, name) for name in rig.buses})
-        if stuck:
+        if stuck := watchdog.stuck({name: _pulse(rig, name) for name in rig.buses}):
             log.error("bus_stuck", buses=stuck)
         else:
             notifier.alive()
