@@ -23,6 +23,7 @@ How a turn ends:
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -191,12 +192,16 @@ class Engine:
         when = self.scheduler.rest(now)
         return IDLE if when is None else WaitUntil(when)
 
-    def _wait_for_line(self, ready: float, now: float) -> WaitUntil:
+    def _wait_for_line(self, ready: float, now: float) -> Action:
         self.deliver()
         if self.line.babbling and self.runner.job is not None and self.runner.job.kind is not ESTOP:
             job, self.runner.job = self.runner.job, None
             message = "the line never falls silent: look for a second master or a servo that sends without being asked"
             job.fail(ReplyTimeout(message, bus=self.bus))
+        if self.runner.job is None and self.runner.suspended is None and self.scheduler.is_empty():
+            # Whoever submits a job asks again; until then no timer is needed for the line.
+            due = self.scheduler.polls.due
+            return IDLE if due == math.inf else WaitUntil(max(ready, due))
         self.scheduler.expire(now)
         return WaitUntil(ready)
 

@@ -210,16 +210,14 @@ class Scheduler:
         self._owed[served] = True
         return job
 
+    def is_empty(self) -> bool:
+        """Return whether nothing waits that might be sent or expire before the next poll."""
+        waiting = self.requests.length or self.coalescer.tickets or self._goal_jobs or self._parked or self._stops or self._estops
+        return not (waiting or self.ramps.active or self.nodes.troubled or self.session is not None)
+
     def rest(self, now: float) -> float | None:
         """End what is too old, and return when something becomes due; None: never. Called when nothing can be sent now."""
-        if (
-            self.requests.length
-            or self.coalescer.tickets
-            or self._parked
-            or self.ramps.active
-            or self.nodes.troubled
-            or self.session is not None
-        ):
+        if not self.is_empty():
             self.expire(now)
             return self.wake()
         return None if self.polls.due == math.inf else self.polls.due
