@@ -19,8 +19,8 @@ from tests.campaigns.daemon import answer, daemon
 
 CLIENTS, RATE, HZ, MOVERS = 1000, 3.0, 5.0, 6
 FILES = 4096
-STOPPED = ("EStopped", "NotEnabled")
-"""Errors that a mover gets while the e-stop is latched."""
+STOPPED = ("EStopped", "NotEnabled", "Busy")
+"""Errors that a mover gets while the e-stop is latched or not finished."""
 
 
 @dataclass(slots=True)
