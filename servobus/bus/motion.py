@@ -317,6 +317,8 @@ class Motion:
         while True:
             self._refuse_to_settle(record, moving, parking)
             state = await self._read(servo, SETTLE_PERIOD)
+            if state.moving:  # polls of the position alone do not refresh this
+                state = await self._read(servo, None)
             self._refuse_to_settle(record, moving, parking)  # a stop or a restart meanwhile has changed its goal
             there = record.goal is None or (state.position is not None and abs(state.position - record.goal) <= near)
             if there and not state.moving and servo not in parts.scheduler.ramps.active:
