@@ -1,4 +1,4 @@
-"""The source files of the package and of the tests, parsed once."""
+"""The source files of the package, of the tests and of the scripts, parsed once."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PRODUCT = sorted((ROOT / "servobus").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
+SCRIPTS = [path for path in sorted((ROOT / "scripts").iterdir()) if path.read_text().startswith("#!/usr/bin/env python")]
 
 
 def name_of(path: Path) -> str:

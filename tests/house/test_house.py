@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.house.sources import PRODUCT, ROOT, TESTS, parsed
+from tests.house.sources import PRODUCT, ROOT, SCRIPTS, TESTS, parsed
 
-SOURCES = [*PRODUCT, *TESTS]
+SOURCES = [*PRODUCT, *TESTS, *SCRIPTS]
 PAGE_PATTERNS = ("*.md", "docs/*.md", "tests/*.md", "config/*.yaml", "servobus/**/*.yaml")
 PAGES = [path for pattern in PAGE_PATTERNS for path in sorted(ROOT.glob(pattern))]
 MAX_FILE, MAX_FUNCTION, MAX_PRODUCT = 400, 40, 21_500
@@ -73,6 +73,14 @@ def names_in(tree: ast.AST) -> Iterator[tuple[str, bool]]:
                 yield name, False
             case ast.arg(arg=name) | ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
                 yield name, True
+            case (
+                ast.ExceptHandler(name=str(name))
+                | ast.MatchAs(name=str(name))
+                | ast.MatchStar(name=str(name))
+                | ast.MatchMapping(rest=str(name))
+                | ast.alias(asname=str(name))
+            ):
+                yield name, True
 
 
 def retired_in(name: str, *, variable: bool) -> set[str]:
@@ -88,18 +96,28 @@ def short(path: Path) -> str:
 @pytest.mark.parametrize("path", SOURCES, ids=short)
 def test_no_retired_word_names_anything(path: Path) -> None:
     tree = parsed(path)
-    names = [(path.stem, False), *names_in(tree)]
+    folders = path.relative_to(ROOT).parent.parts
+    names = [(name, False) for name in (*folders, path.stem)] + list(names_in(tree))
     assert {name for name, variable in names if retired_in(name, variable=variable)} == set()
 
 
 def test_the_rule_about_names_finds_what_it_is_for() -> None:
-    tree = ast.parse("class BusKeeper:\n    def look(self, told): self.found = MOST_HZ = told\n")
+    tree = ast.parse(
+        "class BusKeeper:\n    def look(self, told): self.found = MOST_HZ = told\n"
+        "try: import io as keeper\nexcept OSError as heard: pass\n"
+        "match 1:\n case {**known}: pass\n case [*seen]: pass\n case said: pass\n"
+    )
     assert {name for name, variable in names_in(tree) if retired_in(name, variable=variable)} == {
         "BusKeeper",
         "look",
         "told",
         "found",
         "MOST_HZ",
+        "keeper",
+        "heard",
+        "known",
+        "seen",
+        "said",
     }
 
 
