@@ -178,6 +178,18 @@ class Poll:
     request: Callable[[Collection[int]], Request[dict[str, Update]] | None]
 
 
+def single_polls(
+    rates: Mapping[str, float], nodes: Mapping[str, int], read: Callable[[str, str], Request[dict[str, Update]]]
+) -> list[Poll]:
+    """Return a poll for each rate and servo, where one request asks one servo: `read(name of the rate, name of the servo)`."""
+
+    def poll(name: str, hz: float, servo: str, node: int) -> Poll:
+        request = read(name, servo)
+        return Poll(name, hz, (node,), lambda reachable: request if node in reachable else None)
+
+    return [poll(name, hz, servo, node) for name, hz in rates.items() for servo, node in nodes.items()]
+
+
 class Commissioning(ABC):
     """Gives servos their ids and rates: one change at a time, read back, saved on request. For exclusive sessions."""
 

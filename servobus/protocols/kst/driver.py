@@ -13,7 +13,7 @@ from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols import fence
-from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
+from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask, single_polls
 from servobus.protocols.kst import goals, identity
 from servobus.protocols.kst.codec import Command, decode_position, version_text
 from servobus.protocols.kst.commissioning import KstCommissioning
@@ -113,14 +113,7 @@ class KstDriver(Driver):
 
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
         """Return one read for each servo: the position for feedback, the status for health."""
-        return [
-            Poll(part, hz, (node,), partial(self._poll_request, servo, part))
-            for part, hz in rates.items()
-            for servo, node in self.nodes.items()
-        ]
-
-    def _poll_request(self, servo: str, part: str, reachable: Collection[int]) -> Request[dict[str, Update]] | None:
-        return self._state_reads[servo, part] if self.nodes[servo] in reachable else None
+        return single_polls(rates, self.nodes, lambda part, servo: self._state_reads[servo, part])
 
     def _state_read(self, name: str, part: str) -> Request[dict[str, Update]]:
         servo = self.servos[name]
