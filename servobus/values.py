@@ -42,6 +42,9 @@ class EventName(Described):
     SERVO_MISSING = "servo_missing", "A configured node did not answer when the line was opened.", "bus servo id reason"
     SERVO_NOTE = "servo_note", "A setting of the servo does not fit the config.", "bus servo note"
     SERVO_RESTARTED = "servo_restarted", "The servo restarted: it lost its torque and its volatile settings.", "bus servo id"
+    TORQUE_LOST = "torque_lost", "The torque of an enabled servo is off, and not by us; the servo is disabled.", "bus servo id"
+    STOP_OWED = "stop_owed", "A stop is not confirmed; it is repeated until the servo confirms it.", "bus servo action detail"
+    STOP_PAID = "stop_paid", "A stop that was owed is confirmed.", "bus servo action"
     MOTION_CUT = "motion_cut", "Motion that was under way was ended.", "bus servo reason"
     GOAL_CLAMPED = "goal_clamped", "A goal was moved to the limit (`on_limit: clamp`).", "bus servo asked applied"
     PARK_UNCONFIRMED = "park_unconfirmed", "A servo was to be parked, and it is not confirmed that it was.", "bus servo detail"
@@ -75,6 +78,13 @@ class Health(Described):
     ONLINE = "online", "The node answers what it is asked."
     DOUBTFUL = "doubtful", "A reply is missing or came unasked; a fence comes before the next request to the node."
     OFFLINE = "offline", "The node missed several replies in a row; it is probed with growing pauses, and nothing waits for it."
+
+
+class Loss(Described):
+    """How an enabled servo can turn out not to be as it was left: see `Motion.verify`."""
+
+    RESTARTED = "restarted", "The servo restarted: its volatile settings are gone."
+    TORQUE_OFF = "torque_off", "Its torque is off, and not by us: a protection of the servo or another program switched it off."
 
 
 GoalKind: TypeAlias = Literal["position", "velocity"]
@@ -131,7 +141,9 @@ class Calibration:
         return self.direction * rate / self.unit_per_step
 
 
-Update: TypeAlias = dict[str, Any]  # fields of `State` that one reply brought
+Update: TypeAlias = dict[str, Any]
+"""Fields of `State` that one reply brought. `loss` beside them: what the reply says about a servo that is enabled, a `Loss`, or
+None where it is as it was left; absent: the reply says nothing about that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +160,7 @@ class State:
         temperature: In degrees Celsius.
         moving: Whether the servo says that it moves.
         enabled: Whether its torque was switched on here.
+        energised: Whether its torque was on when it was read, whoever switched it on; None: its protocol does not tell.
         faults: Names of the faults that it reports.
         status: The status byte from which they are taken.
         health: Whether its node answers.
@@ -164,6 +177,7 @@ class State:
     temperature: float | None = None
     moving: bool | None = None
     enabled: bool = False
+    energised: bool | None = None
     faults: tuple[str, ...] = ()
     status: int | None = None
     health: Health = Health.OFFLINE
@@ -221,28 +235,35 @@ class Identity:
         model: Name of a model file that fits.
         product: Its product name or number.
         firmware: Its firmware version.
-        mode: "position" or "velocity".
+        mode: "position", "velocity", or another mode by its name ("pwm", "step", "motor", "mode 7"), in which it takes no goal.
         energised: Whether its torque is on, whoever switched it on.
         limits: Its own stored limits, in its unit.
         notes: Settings that do not fit the config, for a person.
+        obstacle: Why it must not be moved; empty: it may be moved.
     """
 
     model: str | None = None
     product: str | None = None
     firmware: str | None = None
-    mode: GoalKind | None = None
+    mode: str | None = None
     energised: bool | None = None
     limits: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
+    obstacle: str = ""
 
 
 @dataclass(slots=True)
 class ServoGoal:
-    """One goal of one servo, on its way to the wire. Only `packed` is set later, once the driver has checked the goal."""
+    """One goal of one servo, on its way to the wire. Only `packed` and `applied` are set later."""
 
     servo: str
     goal: Goal
     start: float | None = None  # the last known position, for a duration that has to become a speed
+    lead: float | None = None
+    """How far ahead of where the servo is read this setpoint may be, in its unit; None: as far as it is. The driver reads the
+    servo first and sends a nearer position where it is behind."""
+    applied: float | None = field(default=None, compare=False)
+    """The position that the driver sent, where `lead` made it nearer than the goal's value."""
     packed: Any = field(default=None, compare=False, repr=False)
     """What `Driver.check_goal` returned for this goal, so that it is not packed twice; None: it was not checked yet."""
 
@@ -254,7 +275,7 @@ class StopTarget:
     servo: str
     kind: Literal["hold", "limp"]
     enabled: bool  # enabled by us; one that is not is asked whether its torque is on before it is held
-    position: float | None = None  # the present position, if it is fresh enough to be written at once
+    position: float | None = None  # where it is taken to be now: to be written only where it cannot be asked
     setpoint: float | None = None  # the last position that was sent or held; None: not known
     reachable: bool = True  # False: known to be offline; it is written to, and not waited for
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeAlias, TypeVar
 
 from servobus.errors import DeviceError, NotSupported, ServobusError
-from servobus.values import Change, Identity, Outcome, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Change, Identity, Loss, Outcome, ServoGoal, StopReport, StopTarget, Update
 
 R = TypeVar("R")
 
@@ -322,6 +322,24 @@ class Motion(ABC):
         One servo that does not answer must not delay the others by more than its own turn.
         """
 
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+        """Return the plan that finds out which of these enabled servos are not as they were left, in the fewest turns.
+
+        It comes before a goal whose servo was not verified lately: a goal would energise a servo that has restarted. Its value
+        names those alone. A servo that does not answer becomes doubtful as after any request; the plan raises nothing for it.
+        The default asks nothing: a servo of this protocol shows no restart.
+        """
+        yield from ()
+        return {}
+
+    def blind_stop(self, target: StopTarget) -> Sequence[Request[Any]]:
+        """Return the frames that stop a servo that does not answer, as far as that can be done without asking it.
+
+        They need no reply, may be sent again and again, and must not make a servo travel or energise it that has restarted
+        meanwhile: torque off, speed 0. Nothing where there is no such frame (a hold needs the present position).
+        """
+        return ()
+
     @abstractmethod
     def check_goal(self, goal: ServoGoal) -> Any:
         """Raise LimitError or NotSupported for what the model or the line cannot carry.
@@ -364,27 +382,10 @@ class Driver(Addressing, Reading, Writing, Motion, ABC):
     def use_traits(self, traits: LineTraits) -> None:
         """Learn what the line can carry; called before the first request."""
 
+    def use_options(self, options: Any) -> bool:
+        """Take the options of a config that was read again, with the same line, ids and models; return whether that is done.
 
-@dataclass(frozen=True, slots=True)
-class DeviceReply:
-    """What a simulated device sends: `delay` seconds after the end of the request, and after the replies of lower slots."""
-
-    data: bytes
-    delay: float = 0.0
-    slot: int = 0
-    late: float = 0.0
-    """More delay, caused by a fault: it counts also on a line whose bytes take no time."""
-
-
-class Device(Protocol):
-    """A simulated node: the other end of the same frames and the same register map. Sans-IO; the caller passes the time."""
-
-    @property
-    def node(self) -> int: ...
-
-    @property
-    def baudrate(self) -> int:
-        """The rate it is set to; it understands no other."""
-
-    def handle(self, packet: Any, now: float) -> Sequence[DeviceReply]:
-        """Return the replies to a whole valid frame, which may be for another node. `now`: monotonic seconds."""
+        Called between two turns, also while servos are enabled. What was learned of the servos remains. False, the default: the
+        bus has to be opened again.
+        """
+        return False

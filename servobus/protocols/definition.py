@@ -8,7 +8,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from servobus.protocols.base import Codec, Device, Driver
+from servobus.protocols.base import Codec, Driver
+from servobus.protocols.device import Device
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from random import Random
 from urllib.parse import parse_qs, urlsplit
 
-from servobus.protocols.base import Device
+from servobus.protocols.device import Device
 from servobus.protocols.modbus.codec import ModbusCodec
 from servobus.protocols.model import ServoModel
 from servobus.protocols.options import BusOptions

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 
-from servobus.protocols.base import Codec, Device, DeviceReply
+from servobus.protocols.base import Codec
+from servobus.protocols.device import Device, DeviceReply
 from servobus.timers import FineTimer, clock_of
 
 TOLERANCE = 0.03

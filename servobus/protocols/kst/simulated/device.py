@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
-from servobus.protocols.base import DeviceReply
+from servobus.protocols.device import DeviceReply
 from servobus.protocols.kst import codec
 from servobus.protocols.kst.codec import BAUD_TABLE, BROADCAST, FACTORY_ID, REFUSED, REPLY, VERSION, Command, Frame, encode
 from servobus.protocols.kst.model import KstModel

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from servobus.protocols.base import DeviceReply
+from servobus.protocols.device import DeviceReply
 from servobus.protocols.modbus.codec import BROADCAST, MAX_READ, REFUSED, Frame, Function, encode, pack, unpack
 from servobus.protocols.roh.model import NEWEST, RohModel
 from servobus.protocols.roh.options import RohBus

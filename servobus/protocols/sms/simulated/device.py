@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
-from servobus.protocols.base import DeviceReply
+from servobus.protocols.device import DeviceReply
 from servobus.protocols.sms.codec import ANSWERED_BROADCASTS, BROADCAST_ID, WRITES, Instruction, Packet, encode
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus

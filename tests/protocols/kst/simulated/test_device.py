@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from servobus.protocols.base import Device
+from servobus.protocols.device import Device
 from servobus.protocols.kst import DEFINITION
 from servobus.protocols.kst.aborts import ABORTS
 from servobus.protocols.kst.codec import FACTORY_ID, REQUEST_SIZES, Command, encode, encode_position
