@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from servobus.engine.health import Node
+from servobus.errors import ServobusError
 from servobus.protocols.options import ServoOptions
 from servobus.values import Identity, State, Update
 
@@ -14,6 +15,7 @@ class ServoRecord:
 
     __slots__ = (
         "_fields",
+        "cut",
         "enabled",
         "generation",
         "goal",
@@ -47,20 +49,55 @@ class ServoRecord:
         """The last position sent, or held: behind `goal` while the host ramps the servo."""
         self.ramped = False
         """The setpoint is one of a ramp."""
+        self.cut: ServobusError | None = None
+        """Why its last motion was ended before it arrived; None: it was not."""
         self.position_at: float | None = None
         self.updated_at: float | None = None
         self._fields: dict[str, Any] = {}
 
     def update(self, fields: Update, now: float) -> None:
+        """Keep what a reply brought."""
         self._fields.update(fields)
+        self._fields.pop("loss", None)
         self.updated_at = now
         if "position" in fields:
             self.position_at = now
 
-    def hold_at(self, position: float | None) -> None:
-        """Note that the servo holds this position; None: it is not known where."""
+    def hold_at(self, position: float | None, cut: ServobusError | None = None) -> None:
+        """Note that the servo holds this position; None: it is not known where. `cut`: why its motion was ended, if it was."""
         self.goal = self.setpoint = position
         self.ramped = False
+        self.cut = cut
+
+    def disable(self) -> None:
+        """Refuse goals from now on, also those of an enable that is under way."""
+        self.generation += 1
+        self.enabled = False
+
+    def torque_is(self, *, on: bool) -> None:
+        """Note that its torque was read back, on or off."""
+        if "energised" in self._fields:
+            self._fields["energised"] = on
+
+    def estimate(self, now: float, max_age: float) -> float | None:
+        """Return where the servo is taken to be: where it was last read, and on towards its goal at the speed that it had then.
+
+        None: it was not read for `max_age` seconds.
+        """
+        position, speed = self.position(now, max_age), self._fields.get("speed")
+        if position is None or not speed or self.position_at is None:
+            return position
+        moved = position + speed * (now - self.position_at)
+        if self.goal is None:
+            return float(moved)
+        return float(min(max(moved, min(position, self.goal)), max(position, self.goal)))
+
+    def arrived(self, near: float) -> bool:
+        """Return whether it was last read at rest within `near` of its goal; True also where it has none."""
+        position = self._fields.get("position")
+        return self.goal is None or (
+            position is not None and abs(position - self.goal) <= near and not self._fields.get("moving")
+        )
 
     def position(self, now: float, max_age: float) -> float | None:
         """Return the last position read, if it is fresh enough."""

@@ -7,7 +7,7 @@ servo that restarted is disabled, and its goal is not sent again.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Mapping, Sequence
 from typing import Any, cast
 
 from servobus.bus.commissioning import Sessions
@@ -16,17 +16,20 @@ from servobus.bus.master import BusMaster
 from servobus.bus.motion import Motion
 from servobus.bus.records import ServoRecord
 from servobus.bus.requests import BusParts, EmitEvent, Requests
+from servobus.bus.stops import Stops
 from servobus.engine.duplex import DuplexEngine
 from servobus.engine.engine import Engine
-from servobus.engine.health import MAX_ALLOWANCE, OFFLINE, Node, NodeTable
+from servobus.engine.health import MAX_ALLOWANCE, OFFLINE, ONLINE, Node, NodeTable
 from servobus.engine.line import EchoFilter, Line
 from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats, Counter
 from servobus.errors import NotSupported
-from servobus.protocols.base import Codec, Driver, LineTraits
+from servobus.protocols.base import Codec, Driver, LineTraits, Request
 from servobus.protocols.options import BusOptions, ServoOptions
 from servobus.timers import clock_of
-from servobus.values import EventName, Health, State, Update
+from servobus.values import EventName, Health, Loss, State, Update
+
+_UNKNOWN = object()
 
 
 class BusService:
@@ -57,7 +60,8 @@ class BusService:
         self.read_register = requests.read_register
         self.discovery = Discovery(self.parts, requests, self.read)
         self.identify = self.discovery.identify
-        self.motion = Motion(self.parts, requests, identify=self.identify, read=self.read)
+        self.stops = Stops(self.parts)
+        self.motion = Motion(self.parts, requests, self.stops, identify=self.identify, read=self.read)
         sessions = Sessions(self.parts, requests, self.motion)
         self.exclusive = sessions.exclusive
         self.commission = sessions.commission
@@ -70,6 +74,8 @@ class BusService:
             enabled_servos=self._enabled_on,
             on_update=self._polled,
             on_restart=self._restarted,
+            on_loss=self._lost,
+            blind_stops=self._blind_stops,
             on_cut=self._cut,
             on_setpoint=self._setpoint_sent,
             goal_rate_hz=self.options.rate_of_goals,
@@ -87,8 +93,8 @@ class BusService:
             await self.discovery.probe_echo()
         self.driver.use_traits(self.line.traits)
         await self.discovery.identify_all()
-        if self.master.up and self.motion.latched:
-            await self.motion.stop()  # it was asked for while the line was down
+        if self.master.up and self.stops.latched:
+            await self.stops.stop()  # it was asked for while the line was down
         if self.master.up:
             self.scheduler.set_polls(self.driver.polls(self.options.poll.rates()), self.clock())
 
@@ -127,8 +133,8 @@ class BusService:
             Counter.DRAINS: self.line.drains,
             Counter.COLLISIONS: self.line.echo.collisions if self.line.echo else 0,
             Counter.POLLS_MISSED: self.scheduler.polls.missed,
-            Counter.GOAL_GROUPS_SPLIT: self.scheduler.split_groups,
-            Counter.GOAL_TURNS: self.scheduler.goal_turns,
+            Counter.GOAL_GROUPS_SPLIT: self.scheduler.goals.split_groups,
+            Counter.GOAL_TURNS: self.scheduler.goals.turns,
         }
         nodes = {
             str(node.id): {
@@ -147,6 +153,9 @@ class BusService:
     def _enabled_on(self, node: Node) -> list[str]:
         return [record.name for record in self.parts.on(node) if record.enabled]
 
+    def _blind_stops(self, node: Node) -> Sequence[Request[Any]]:
+        return self.stops.blind_frames(node)
+
     def _polled(self, result: dict[str, Update] | Exception) -> None:
         """A poll has ended; one that failed shows in the health of its nodes."""
         if isinstance(result, dict):
@@ -154,9 +163,14 @@ class BusService:
             self._update(result)
 
     def _update(self, result: dict[str, Update]) -> None:
-        now = self.clock()
+        now, verification = self.clock(), self.scheduler.goals.verification
         for servo, fields in result.items():
             self.records[servo].update(fields, now)
+            loss = fields.get("loss", _UNKNOWN)
+            if loss is None:
+                verification.confirm(servo, now)
+            elif loss is not _UNKNOWN and self.records[servo].enabled:
+                self._lost(servo, loss)
 
     def _setpoint_sent(self, servo: str, setpoint: float) -> None:
         self.motion.setpoint_sent(servo, setpoint)
@@ -165,9 +179,17 @@ class BusService:
         """A setpoint of the host's ramp failed on the way."""
         self.emit(EventName.MOTION_CUT, bus=self.name, servo=servo, reason=str(error))
 
+    def _lost(self, servo: str, loss: Loss) -> None:
+        """An enabled servo is not as it was left."""
+        record = self.records[servo]
+        if loss is Loss.RESTARTED:
+            self._restarted(record.node)
+        elif self.motion.lost([record], loss):
+            self.emit(EventName.TORQUE_LOST, bus=self.name, servo=servo, id=record.node.id)
+
     def _restarted(self, node: Node) -> None:
         self.stats.counts[Counter.RESTARTS] += 1
-        for record in self.motion.disable_restarted(node):
+        for record in self.motion.lost(self.parts.on(node), Loss.RESTARTED):
             self.emit(EventName.SERVO_RESTARTED, bus=self.name, servo=record.name, id=node.id)
         self.discovery.restarted(node)
 
@@ -175,6 +197,10 @@ class BusService:
         self.scheduler.node_changed(node)
         if not node.configured:
             return
+        if node.health is ONLINE:
+            self.stops.node_online(node)
+        else:
+            self.scheduler.goals.verification.forget(record.name for record in self.parts.on(node))
         if OFFLINE in (node.health, before):
             names = ",".join(record.name for record in self.parts.on(node))
             self.emit(EventName(f"servo_{node.health}"), bus=self.name, servo=names, id=node.id)

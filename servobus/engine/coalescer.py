@@ -8,6 +8,7 @@ caller wanted last, and the others still leave in one plan.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
@@ -38,6 +39,9 @@ class Ticket:
     confirm: bool = False
     gone: Callable[[], bool] = _never
     """Returns whether its caller has left: then the goal is dropped without a result."""
+    put_at: float = 0.0
+    first_expires: float = math.inf
+    """When the first of the goals expired that it, and those before it, have replaced."""
 
     @property
     def servo(self) -> str:
@@ -65,12 +69,17 @@ class Coalescer:
         return len(self.tickets)
 
     def put(self, ticket: Ticket) -> None:
-        """Take the newest goal of its servo; the older one ends as SUPERSEDED."""
+        """Take the newest goal of its servo; the older one ends as SUPERSEDED.
+
+        Where none of a stream of goals could leave for as long as one may wait, each ends as GoalExpired: the servo is dead.
+        """
         servo = ticket.goal.servo
         older = self.tickets.get(servo)
         self.tickets[servo] = ticket
-        if older is not None:
-            older.done(Outcome.SUPERSEDED)
+        if older is None:
+            return
+        ticket.first_expires = min(older.expires, older.first_expires)
+        older.done(_expired(servo) if ticket.put_at >= ticket.first_expires else Outcome.SUPERSEDED)
 
     def put_back(self, ticket: Ticket) -> None:
         """Take back a goal that could not leave: it waits again, unless a newer goal has come."""

@@ -20,6 +20,8 @@ OFFLINE_AFTER = 3
 """Misses in a row."""
 FIRST_BACKOFF = 0.050
 MAX_BACKOFF = 3.2
+MAX_OWED_BACKOFF = 0.4
+"""The same for a node that owes a stop: it is to be stopped as soon as it can be heard."""
 MAX_OUTSTANDING = 64
 
 # Looking a member up in its enum is a Python call, and some of these are read in every turn.
@@ -40,6 +42,7 @@ class Node:
         "misses",
         "next_probe",
         "outstanding",
+        "owes_stop",
         "reply_allowance_s",
         "status",
     )
@@ -55,6 +58,8 @@ class Node:
         """The newest health byte, where the protocol has one."""
         self.outstanding: dict[Hashable, float] = {}
         """reply_key of each missing reply -> request time, oldest first."""
+        self.owes_stop = False
+        """A stop of a servo of this node is not confirmed yet."""
         self.misses = 0
         self.backoff = 0.0
         self.next_probe = 0.0
@@ -110,7 +115,8 @@ class Node:
             return
         self.health = OFFLINE
         self.reply_allowance_s = min(FIRST_ALLOWANCE, self.max_allowance_s)
-        self.backoff = min(2 * self.backoff, MAX_BACKOFF) if self.backoff else FIRST_BACKOFF
+        longest = MAX_OWED_BACKOFF if self.owes_stop else MAX_BACKOFF
+        self.backoff = min(2 * self.backoff, longest) if self.backoff else FIRST_BACKOFF
         self.next_probe = now + self.backoff
 
     def late(self, key: Hashable, now: float) -> None:
@@ -127,6 +133,12 @@ class Node:
         self.health = ONLINE
         self.misses = 0
         self.backoff = 0.0
+
+    def owe_stop(self, now: float, *, owed: bool) -> None:
+        """Note whether the node owes a stop; the probe of one that does is due soon."""
+        self.owes_stop = owed
+        if owed and self.health is OFFLINE:
+            self.next_probe = min(self.next_probe, now + MAX_OWED_BACKOFF)
 
     def suspect(self) -> None:
         """Doubt the node because the line was lost."""

@@ -15,15 +15,17 @@ from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any
 
-from servobus.engine.coalescer import Coalescer, Group, Ticket
+from servobus.engine.coalescer import Ticket
+from servobus.engine.goals import GoalQueue
 from servobus.engine.health import OFFLINE, Node, NodeTable
 from servobus.engine.job import Callback, Job, JobKind
 from servobus.engine.polls import PollGrid
 from servobus.engine.queue import RequestQueue, overloaded
 from servobus.engine.ramp import SetpointRamps
+from servobus.engine.verification import Verification
 from servobus.errors import DeviceError, ReplyTimeout, ServobusError
-from servobus.protocols.base import Driver, GoalPlan, Plan, Poll
-from servobus.values import Outcome
+from servobus.protocols.base import Driver, Plan, Poll, Request
+from servobus.values import Loss
 
 QUEUE_LIMIT = 1024
 """Jobs that may wait on one bus."""
@@ -51,20 +53,20 @@ class Scheduler:
         enabled_servos: Callable[[Node], Collection[str]],
         on_update: Callable[[Any], None],
         on_restart: Callable[[Node], None],
+        on_loss: Callable[[str, Loss], None],
+        blind_stops: Callable[[Node], Sequence[Request[Any]]],
         on_cut: Callable[[str, Exception], None],
         on_setpoint: Callable[[str, float], None],
         goal_rate_hz: float,
         limit: int = QUEUE_LIMIT,
     ) -> None:
         self.nodes = nodes
-        self.coalescer = Coalescer()
-        self.ramps = SetpointRamps(goal_rate_hz, on_cut, on_setpoint)
+        ramps = SetpointRamps(goal_rate_hz, on_cut, on_setpoint)
+        self.goals = GoalQueue(driver, nodes, ramps, Verification(driver, on_loss))
         self.requests = RequestQueue(limit)
         self.polls = PollGrid()
         self.session: object = None
         """The open exclusive session."""
-        self.split_groups = 0
-        self.goal_turns = 0
         self.wanted: Callable[[], None] = _ignore
         """Called when something was put that may leave at once: the shell sets it, and then asks for the next action."""
         self._driver = driver
@@ -72,14 +74,14 @@ class Scheduler:
         self._enabled_servos = enabled_servos
         self._on_update = on_update
         self._on_restart = on_restart
+        self._blind_stops = blind_stops
         self._estops: deque[Job] = deque()
         self._stops: deque[Job] = deque()
-        self._goal_jobs: deque[tuple[Job, Sequence[Ticket]]] = deque()
         self._parked: list[Job] = []
         """Jobs for offline nodes."""
         self._parked_until = math.inf
         """When the first of the parked jobs has waited long enough."""
-        self._takers = (self._next_goal, self.requests.take, self._next_poll, self._next_probe)
+        self._takers = (self.goals.take, self.requests.take, self._next_poll, self._next_probe)
         self._owed = [False] * CLASSES
         """Classes that owe one turn to a lower class."""
 
@@ -127,11 +129,7 @@ class Scheduler:
 
     def put_goal(self, ticket: Ticket, now: float, *, speed: float | None = None, start: float | None = None) -> None:
         """Take the newest goal of a servo. With `speed` (unit/s) the host ramps it from `start`, the last setpoint."""
-        if speed is not None:
-            self.ramps.begin(ticket, speed, start, now)
-        elif self.ramps.active:
-            self.ramps.drop({ticket.servo})
-        self.coalescer.put(ticket)
+        self.goals.put(ticket, now, speed=speed, start=start)
         self.wanted()
 
     def put_stop(self, job: Job) -> None:
@@ -157,7 +155,7 @@ class Scheduler:
     def waiting(self) -> int:
         """Return the number of jobs and goals that wait, for people."""
         stops = len(self._estops) + len(self._stops)
-        return stops + len(self.requests) + len(self.coalescer) + len(self._parked) + len(self._goal_jobs)
+        return stops + len(self.requests) + len(self._parked) + len(self.goals)
 
     # The decision
 
@@ -183,10 +181,11 @@ class Scheduler:
 
     def _only_requests(self, now: float) -> bool:
         """Return whether requests wait, and nothing of any other class can be due."""
+        goals = self.goals
         return not (
-            self._goal_jobs
-            or self.coalescer.tickets
-            or self.ramps.active
+            goals.planned
+            or goals.coalescer.tickets
+            or goals.ramps.active
             or self.polls.due <= now
             or (self.nodes.troubled and self.nodes.due_probe(now))
         )
@@ -212,8 +211,9 @@ class Scheduler:
 
     def is_empty(self) -> bool:
         """Return whether nothing waits that might be sent or expire before the next poll."""
-        waiting = self.requests.length or self.coalescer.tickets or self._goal_jobs or self._parked or self._stops or self._estops
-        return not (waiting or self.ramps.active or self.nodes.troubled or self.session is not None)
+        goals = self.goals
+        waiting = self.requests.length or goals.coalescer.tickets or goals.planned or self._parked or self._stops or self._estops
+        return not (waiting or goals.ramps.active or self.nodes.troubled or self.session is not None)
 
     def rest(self, now: float) -> float | None:
         """End what is too old, and return when something becomes due; None: never. Called when nothing can be sent now."""
@@ -224,16 +224,16 @@ class Scheduler:
 
     def wake(self) -> float | None:
         """Return when something becomes due or too old, if nothing else happens; None: never."""
-        times = [self._parked_until, self.requests.next_expiry(), self.coalescer.next_expiry()]
+        times = [self._parked_until, self.requests.next_expiry(), self.goals.coalescer.next_expiry()]
         if self.session is None:
-            times += (self.polls.due, self.nodes.next_probe(), self.ramps.next_due())
+            times += (self.polls.due, self.nodes.next_probe(), self.goals.ramps.next_due())
         soonest = min(time for time in times if time is not None)
         return None if soonest == math.inf else soonest
 
     def expire(self, now: float) -> None:
         """End what is too old. Called when nothing can be sent, or nothing is due."""
         self.requests.expire(now)
-        self.coalescer.expire(now)
+        self.goals.coalescer.expire(now)
         self._end_parked(now)
 
     # Offline nodes
@@ -274,14 +274,7 @@ class Scheduler:
 
     def drop_goals(self, error: Callable[[str], ServobusError], servos: Collection[str] | None = None) -> None:
         """End all goals that have not left, or those of some servos, with an error. The others of a plan are planned anew."""
-        goal_jobs, self._goal_jobs = self._goal_jobs, deque()
-        for job, tickets in goal_jobs:
-            if servos is None or any(ticket.servo in servos for ticket in tickets):
-                self._unplan(job, tickets)
-            else:
-                self._goal_jobs.append((job, tickets))
-        self.coalescer.drop(error, servos)
-        self.ramps.drop(servos)
+        self.goals.drop(error, servos)
 
     def drop(self, error: Callable[[str], ServobusError], *, motion_only: bool) -> None:
         """End everything that waits, or only what would move something."""
@@ -300,49 +293,6 @@ class Scheduler:
 
     # The classes
 
-    def _next_goal(self, now: float) -> Job | None:
-        for ticket in self.ramps.due(now):
-            self.coalescer.put(ticket)
-        while self._goal_jobs:
-            job, tickets = self._goal_jobs.popleft()
-            ready = self.nodes.reachable()
-            if all(ticket.node in ready and ticket.expires > now and not ticket.gone() for ticket in tickets):
-                self.goal_turns += 1
-                return job
-            # A plan of a split group waited, and is too old now, or a servo of it missed a reply: it may have restarted.
-            self._unplan(job, tickets)
-        if not self._plan_goals(now):
-            return None
-        job, _ = self._goal_jobs.popleft()  # the coalescer has just checked its tickets
-        self.goal_turns += 1
-        return job
-
-    def _unplan(self, job: Job, tickets: Sequence[Ticket]) -> None:
-        """Take a plan back that has not begun; its goals wait again."""
-        assert job.plan is not None
-        job.plan.close()
-        for ticket in tickets:
-            self.coalescer.put_back(ticket)
-
-    def _plan_goals(self, now: float) -> bool:
-        """Make jobs of the next group. False: no group is ready."""
-        while len(self.coalescer):
-            group = self.coalescer.take(now, self.nodes.reachable())
-            if group is None:
-                return False
-            try:
-                plans = self._driver.plan_goals(
-                    [ticket.goal for ticket in group.tickets], together=group.together, confirm=group.confirm
-                )
-            except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its goals, never the bus
-                for ticket in group.tickets:
-                    ticket.done(error)
-                continue
-            self.split_groups += len(plans) > 1
-            self._goal_jobs.extend(_goal_job(plan, group) for plan in plans)
-            return True
-        return False
-
     def _next_poll(self, now: float) -> Job | None:
         while (poll := self.polls.take(now)) is not None:
             request = poll.request(self.nodes.reachable())
@@ -358,7 +308,12 @@ class Scheduler:
         return Job(sink, now + POLL_PATIENCE, plan=self.fence(node), node=node.id, kind=JobKind.PROBE)
 
     def fence(self, node: Node) -> Plan[bool]:
-        """Return the plan after which a node is believed again. Its result: whether the servo still is as we left it."""
+        """Return the plan after which a node is believed again. Its result: whether the servo still is as we left it.
+
+        A node that owes a stop is sent first what stops it without a question.
+        """
+        if node.owes_stop:
+            yield from self._blind_stops(node)
         kept = yield from self._driver.fence(node.id, list(node.outstanding), self._enabled_servos(node))
         if not kept:
             self._on_restart(node)
@@ -368,25 +323,6 @@ class Scheduler:
 
 def _ignore() -> None:
     pass
-
-
-def _goal_job(plan: GoalPlan, group: Group) -> tuple[Job, Sequence[Ticket]]:
-    tickets = group.tickets
-    if len(plan.servos) < len(tickets):
-        tickets = [ticket for ticket in tickets if ticket.servo in plan.servos]
-    expires = max([ticket.expires for ticket in tickets])
-    sink = Callback(partial(_end_tickets, tickets))
-    return Job(sink, expires, plan=plan.plan, node=tickets[0].node, kind=JobKind.MOTION), tickets
-
-
-def _end_tickets(tickets: Sequence[Ticket], result: dict[str, Outcome | Exception] | Exception) -> None:
-    """End the tickets of one plan, with a result for each or with one error for all."""
-    if isinstance(result, dict):
-        for ticket in tickets:
-            ticket.done(result[ticket.goal.servo])
-    else:
-        for ticket in tickets:
-            ticket.done(result)
 
 
 def _probed(node: Node, later: float, result: object) -> None:

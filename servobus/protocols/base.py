@@ -322,15 +322,14 @@ class Motion(ABC):
         One servo that does not answer must not delay the others by more than its own turn.
         """
 
-    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]] | None:
         """Return the plan that finds out which of these enabled servos are not as they were left, in the fewest turns.
 
         It comes before a goal whose servo was not verified lately: a goal would energise a servo that has restarted. Its value
         names those alone. A servo that does not answer becomes doubtful as after any request; the plan raises nothing for it.
-        The default asks nothing: a servo of this protocol shows no restart.
+        None, the default: no question shows that.
         """
-        yield from ()
-        return {}
+        return None
 
     def blind_stop(self, target: StopTarget) -> Sequence[Request[Any]]:
         """Return the frames that stop a servo that does not answer, as far as that can be done without asking it.

@@ -118,7 +118,7 @@ class LocalRig(Rig):
         self._index()
         new = [name for name in wanted if name not in kept]
         for name in new:
-            self.buses[name].motion.latched = latched
+            self.buses[name].stops.latched = latched
             self._group.start_soon(self.supervisors[name].run, True)
         added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
         report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
@@ -184,7 +184,7 @@ class LocalRig(Rig):
         parking = [
             (supervisor, record) for supervisor in self.supervisors.values() for record in supervisor.enabled("on_estop", "park")
         ]
-        reports = await asyncio.gather(*(bus.motion.stop() for bus in self.buses.values()))
+        reports = await asyncio.gather(*(bus.stops.stop() for bus in self.buses.values()))
         for supervisor, record in parking:
             self._track(supervisor.park(record))
         return {f"{bus}/{servo}": report for bus, part in zip(self.buses, reports, strict=True) for servo, report in part.items()}
@@ -199,12 +199,12 @@ class LocalRig(Rig):
         if self._stopping:
             raise Busy("servos are still being stopped or parked: clear when they are at rest")
         for bus in self.buses.values():
-            bus.motion.latched = False
+            bus.stops.latched = False
         self._event(EventName.ESTOP_CLEARED)
 
     @property
     def stopped(self) -> bool:
-        return any(bus.motion.latched for bus in self.buses.values())
+        return any(bus.stops.latched for bus in self.buses.values())
 
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
         full = self.full_names(names)
@@ -230,7 +230,7 @@ class LocalRig(Rig):
     @staticmethod
     async def _abandon(supervisor: BusSupervisor, servos: Collection[str]) -> dict[str, StopReport]:
         parking = [record for record in supervisor.enabled("on_lost_client", "park") if record.name in servos]
-        reports = await supervisor.bus.motion.abandon(servos)
+        reports = await supervisor.bus.stops.abandon(servos)
         parked = await asyncio.gather(*map(supervisor.park, parking))
         return reports | {record.name: report for record, report in zip(parking, parked, strict=True)}
 

@@ -90,16 +90,19 @@ class BusSupervisor:
         return report
 
     async def leave(self) -> dict[str, StopReport]:
-        """Apply the exit policies, parking first. Returns what was done to each servo, by full name."""
-        motion = self.bus.motion
-        motion.leaving = True
+        """Apply the exit policies. Returns what was done to each servo, by full name.
+
+        What is to be limp goes limp, and everything else holds, before the first servo parks: nothing travels on meanwhile.
+        """
+        stops = self.bus.stops
+        stops.leaving = True
         silent = "no answer in time"
-        left = {record.name: StopReport(record.options.on_exit, False, False, silent) for record in motion.to_leave()}
-        parking = [] if motion.latched else self.enabled("on_exit", "park")  # what the e-stop holds stays where it is
+        left = {record.name: StopReport(record.options.on_exit, False, False, silent) for record in stops.to_leave()}
+        parking = [] if stops.latched else self.enabled("on_exit", "park")  # what the e-stop holds stays where it is
+        with anyio.move_on_after(EXIT_TIMEOUT):
+            await stops.leave(left)
         reports = await asyncio.gather(*map(self.park, parking))
         left.update({record.name: report for record, report in zip(parking, reports, strict=True)})
-        with anyio.move_on_after(EXIT_TIMEOUT):
-            left.update(await motion.leave())
         for servo, report in left.items():
             if not report.confirmed and report.action != "park":  # parking has its own event
                 self._event(EventName.EXIT_UNCONFIRMED, bus=self.name, servo=servo, action=report.action, detail=report.detail)
@@ -107,6 +110,7 @@ class BusSupervisor:
 
     async def close(self) -> None:
         """Close the line, once nothing opens it again."""
+        self.bus.stops.close()
         await self.bus.master.close()
         if isinstance(self.link, SimulatedLink):
             self.link.close()

@@ -155,7 +155,7 @@ async def test_a_node_that_never_stops_talking_holds_back_all_but_an_e_stop() ->
         await asyncio.sleep(0.1)
         puppet.frames.clear()
         waiting = asyncio.create_task(bus.read_register("s1", "present_position", raw=True))
-        stopping = asyncio.create_task(bus.motion.stop())
+        stopping = asyncio.create_task(bus.stops.stop())
         await asyncio.sleep(0.5)
         assert puppet.frames, "the e-stop was sent"
         assert all(frame[4] != Instruction.READ or frame[5] != 56 for frame in puppet.frames[:1])
@@ -171,7 +171,7 @@ async def test_an_e_stop_goes_between_the_frames_of_a_plan() -> None:
         await asyncio.sleep(0.0015)
         sent = len(puppet.frames)
         assert sent > 0
-        await bus.motion.stop()
+        await bus.stops.stop()
         with pytest.raises(Exception, match="e-stop"):
             await enabling
         assert not bus.records["s1"].enabled
@@ -182,7 +182,7 @@ async def test_a_reading_plan_goes_on_after_the_e_stop() -> None:
     async with puppet_bus() as (bus, _, _, _):
         asking = asyncio.create_task(bus.identify("s1"))
         await asyncio.sleep(0.0015)
-        await bus.motion.stop()
+        await bus.stops.stop()
         assert (await asking).firmware == "0.0"
 
 

@@ -32,7 +32,7 @@ async def test_a_lost_line_ends_everything_and_comes_back() -> None:
         for attempt in (bus.read_register("s1", "id"), bus.ping("s1")):
             with pytest.raises(LinkDown, match="down"):
                 await attempt
-        reports = await bus.motion.stop()
+        reports = await bus.stops.stop()
         assert not any(report.written for report in reports.values())
         puppet.script = lambda frame: None
         link.plug()

@@ -26,7 +26,7 @@ async def test_a_caller_who_leaves_takes_its_goal_along() -> None:
         futures["s1"].cancel()
         await asyncio.sleep(0.1)
         assert puppet.frames == []
-        assert len(bus.scheduler.coalescer) == 0
+        assert len(bus.scheduler.goals.coalescer) == 0
 
 
 @virtual
@@ -71,7 +71,7 @@ async def test_an_e_stop_in_the_moment_in_which_enable_succeeds_wins() -> None:
         def script(frame: bytes) -> Answers | None:
             answers = keep(frame)
             if answers and frame[4:6] == bytes((Instruction.READ, 40)):
-                bus.motion.latched = True  # the last answer is on its way
+                bus.stops.latched = True  # the last answer is on its way
             return answers
 
         puppet.script = script
@@ -143,7 +143,7 @@ async def test_a_stop_while_the_position_is_read_is_not_taken_for_arrival() -> N
         puppet.script = script
         settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
         await asked.wait()
-        await bus.motion.stop()
+        await bus.stops.stop()
         with pytest.raises(EStopped, match="before the servo arrived at its goal"):
             await settling
 
@@ -177,7 +177,7 @@ async def test_the_e_stop_ends_an_enable_under_way() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         enabling = asyncio.create_task(bus.motion.enable("s1"))
         await asyncio.sleep(0.0025)
-        await bus.motion.stop()
+        await bus.stops.stop()
         with pytest.raises(EStopped):
             await enabling
         assert not bus.records["s1"].enabled
@@ -200,7 +200,7 @@ async def test_a_servo_that_does_not_arrive_at_its_park_pose_goes_limp() -> None
 async def test_a_bus_without_servos_stops_too() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
         bus.records.clear()
-        assert await bus.motion.stop() == {}
+        assert await bus.stops.stop() == {}
         assert puppet.frames == []
 
 

@@ -99,7 +99,7 @@ async def test_no_session_while_the_e_stop_holds_or_something_is_enabled() -> No
         with pytest.raises(Busy, match="s1, s2 are enabled"):
             async with bus.exclusive():
                 raise AssertionError
-        await bus.motion.stop()
+        await bus.stops.stop()
         with pytest.raises(EStopped):
             async with bus.exclusive():
                 raise AssertionError

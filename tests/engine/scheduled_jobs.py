@@ -85,6 +85,6 @@ def split_bench(ended: Ended, **traits: Any) -> tuple[Bench, Job]:
         bench.coalescer.put(ticket(number, ended, **traits))
     first = bench.scheduler.next_job(0.0)
     assert first is not None
-    assert bench.scheduler.split_groups == 1
+    assert bench.scheduler.goals.split_groups == 1
     assert bench.scheduler.waiting() == 2
     return bench, first

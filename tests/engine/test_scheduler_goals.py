@@ -19,7 +19,7 @@ def test_goals_of_one_tick_are_one_plan_and_each_gets_its_outcome() -> None:
         bench.coalescer.put(ticket(number, ended))
     finish(bench.scheduler.next_job(0.0))
     assert ended == [("s1", Outcome.SENT), ("s2", Outcome.SENT), ("s3", Outcome.SENT)]
-    assert bench.scheduler.split_groups == 0
+    assert bench.scheduler.goals.split_groups == 0
 
 
 def test_one_error_ends_all_goals_of_its_turn() -> None:

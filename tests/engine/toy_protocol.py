@@ -6,7 +6,7 @@ is answered by the number it carries, which makes it the fence. WRITE is confirm
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,12 +15,14 @@ from servobus.engine.health import Node, NodeTable
 from servobus.engine.scheduler import QUEUE_LIMIT, Scheduler
 from servobus.errors import DeviceError
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request
-from servobus.values import Goal, Health, Outcome, ServoGoal
+from servobus.values import Goal, Health, Loss, Outcome, ServoGoal
 
 READ, PING, WRITE, ANSWER = 1, 2, 3, 0x80
 ALL = 0xFF
 REFUSED = 0xEE
 """As a value: the device says no."""
+RESTARTED = 0xDD
+"""As a value of register 0: the device has restarted."""
 
 
 def encode(node: int, *payload: int) -> bytes:
@@ -133,6 +135,8 @@ class ToyDriver:
         self.restarted: set[int] = set()
         self.refusal: Exception | None = None
         """What `plan` raises."""
+        self.verifies = False
+        """A question shows whether a servo has restarted: its register 0 reads `RESTARTED` then."""
 
     def fence(self, node: int, avoid: Sequence[Hashable], enabled: bool) -> Plan[bool]:
         number = next(number for number in range(256) if (PING | ANSWER, number) not in avoid)
@@ -146,6 +150,18 @@ class ToyDriver:
         size = len(names) if together else self.goals_per_frame
         parts = [tuple(names[at : at + size]) for at in range(0, len(names), size)]
         return [GoalPlan(part, self._say(part)) for part in parts]
+
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]] | None:
+        if not self.verifies:
+            return None
+        return self._verify(servos)
+
+    def _verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+        losses = {}
+        for servo in servos:
+            if (yield read(int(servo[1:]))) == RESTARTED:
+                losses[servo] = Loss.RESTARTED
+        return losses
 
     @staticmethod
     def _say(servos: tuple[str, ...]) -> Plan[dict[str, Outcome | Exception]]:
@@ -186,6 +202,7 @@ class Bench:
         self.changes: list[tuple[int, Health, Health]] = []
         self.updates: list[Any] = []
         self.restarts: list[int] = []
+        self.losses: list[tuple[str, Loss]] = []
         self.cuts: list[tuple[str, Exception]] = []
         self.nodes = NodeTable(nodes or (1, 2, 3), changed=self._changed)
         self.scheduler = Scheduler(
@@ -194,6 +211,8 @@ class Bench:
             enabled_servos=lambda node: (),
             on_update=self.updates.append,
             on_restart=lambda node: self.restarts.append(node.id),
+            on_loss=lambda servo, loss: self.losses.append((servo, loss)),
+            blind_stops=lambda node: [shout(node.id)],
             on_cut=lambda servo, error: self.cuts.append((servo, error)),
             on_setpoint=lambda servo, setpoint: None,
             goal_rate_hz=10.0,
@@ -206,7 +225,7 @@ class Bench:
 
     @property
     def coalescer(self) -> Coalescer:
-        return self.scheduler.coalescer
+        return self.scheduler.goals.coalescer
 
     def node(self, number: int) -> Node:
         return self.nodes.node(number)

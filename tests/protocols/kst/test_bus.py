@@ -82,7 +82,7 @@ async def test_a_servo_is_identified_enabled_moved_and_stopped() -> None:
         await asyncio.sleep(0.3)
         state = bus.state("tilt")
         assert (state.position, state.goal, state.faults, state.enabled) == (-30, -30, ("hot",), True)
-        reports = await bus.motion.stop()
+        reports = await bus.stops.stop()
         assert all(report.confirmed and report.action == "hold" for report in reports.values())
         assert events == []
 

@@ -83,7 +83,7 @@ async def test_a_hand_is_identified_enabled_moved_and_stopped() -> None:
         results = await move(bus, **dict.fromkeys(HAND, 40.0))
         assert set(results.values()) == {Outcome.ACKED}
         assert hands[0].written == [(1135 + number, 26214) for number in range(6)]
-        assert bus.scheduler.goal_turns == 1
+        assert bus.scheduler.goals.turns == 1
         assert bus.stats.counts[Counter.FRAMES] - before < 6
         for name in HAND:
             await bus.motion.settle(name, tolerance=None, timeout=5)
@@ -95,7 +95,7 @@ async def test_a_hand_is_identified_enabled_moved_and_stopped() -> None:
         await asyncio.sleep(2)
         assert bus.state("ring").faults == ("stuck",)
         assert bus.state("index").faults == ()
-        reports = await bus.motion.stop()
+        reports = await bus.stops.stop()
         assert all(report.confirmed and report.action == "hold" for report in reports.values())
         assert events == []
 
