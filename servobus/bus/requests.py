@@ -16,7 +16,6 @@ from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats
 from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Driver, Plan, Request
-from servobus.protocols.options import BusOptions
 
 R = TypeVar("R")
 
@@ -35,7 +34,6 @@ class BusParts:
     """What service, motion, discovery and commissioning of one bus share."""
 
     name: str
-    options: BusOptions
     driver: Driver
     records: dict[str, ServoRecord]
     nodes: NodeTable

@@ -47,13 +47,14 @@ class BusService:
             self.line.echo = EchoFilter()
         max_allowance_s = MAX_ALLOWANCE if options.timeout_ms is None else options.timeout_ms / 1000
         self.nodes = NodeTable(set(driver.nodes.values()), max_allowance_s=max_allowance_s, changed=self._node_changed)
-        servos = cast("Mapping[str, ServoOptions]", vars(options)["servos"])  # each protocol narrows it to its own class
-        self.records = {servo: ServoRecord(servo, each, self.nodes.node(driver.nodes[servo])) for servo, each in servos.items()}
+        self.records = {
+            servo: ServoRecord(servo, each, self.nodes.node(driver.nodes[servo])) for servo, each in _servos(options).items()
+        }
         self.scheduler = self._scheduler()
         self.engine = self._engine(codec)
         self.master = BusMaster(self.engine)
         shared = (self.records, self.nodes, self.scheduler, self.line, self.stats, self.master, self.clock, emit)
-        self.parts = BusParts(name, options, driver, *shared)
+        self.parts = BusParts(name, driver, *shared)
         requests = Requests(self.parts)
         self.ask = requests.ask
         self.perform = requests.perform
@@ -97,6 +98,22 @@ class BusService:
             await self.stops.stop()  # it was asked for while the line was down
         if self.master.up:
             self.scheduler.set_polls(self.driver.polls(self.options.poll.rates()), self.clock())
+
+    def use_options(self, options: BusOptions) -> bool:
+        """Take the options of a config that was read again, without a pause; return False where the bus must be opened again.
+
+        The line, the ids, the models and the calibration must be the same; rates, limits, speeds and policies may differ.
+        """
+        if not self.driver.use_options(options):
+            return False
+        rates_before = self.options.poll.rates()
+        self.options = options
+        for name, servo in _servos(options).items():
+            self.records[name].options = servo
+        self.scheduler.goals.ramps.use_rate(options.rate_of_goals)
+        if options.poll.rates() != rates_before and self.master.up:
+            self.scheduler.set_polls(self.driver.polls(options.poll.rates()), self.clock())
+        return True
 
     # Reading and writing
 
@@ -205,3 +222,8 @@ class BusService:
             names = ",".join(record.name for record in self.parts.on(node))
             self.emit(EventName(f"servo_{node.health}"), bus=self.name, servo=names, id=node.id)
         self.discovery.node_changed(node, before)
+
+
+def _servos(options: BusOptions) -> Mapping[str, ServoOptions]:
+    """Return the options of the servos, which each protocol narrows to its own class."""
+    return cast("Mapping[str, ServoOptions]", vars(options)["servos"])

@@ -44,6 +44,12 @@ class SetpointRamps:
         self._sent = sent
         self.active: dict[str, Ramp] = {}
 
+    def use_rate(self, hz: float) -> None:
+        """Take another rate of setpoints. Ramps under way keep their speed."""
+        before, self._period = self._period, 1.0 / hz
+        for ramp in self.active.values():
+            ramp.step *= self._period / before
+
     def begin(self, ticket: Ticket, speed: float, start: float | None, now: float) -> None:
         """Ramp this goal's servo from `start` at `speed` (unit/s), instead of to any earlier goal. The ticket then carries the
         first setpoint. A goal without a start is sent as it is."""
