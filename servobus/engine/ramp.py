@@ -4,21 +4,31 @@ Such a servo goes to each goal as fast as it can. So on the bus's cycle it is se
 never has farther to go than one cycle at the wanted speed. The cases:
 
 1. The caller's ticket carries the first setpoint. The others follow once that one was delivered.
-2. A setpoint that fails ends the ramp, and `cut(servo, error)` reports it; the first one's error goes to the caller.
-3. A newer goal replaces the ramp and starts at the last setpoint, where the servo is or is going.
-4. A cycle that comes late is not caught up with: the next setpoint is one whole period later.
+2. One setpoint is under way at a time. The next one is made when it has ended, so none is superseded by the next: while a
+   servo does not answer, its ramp waits.
+3. Each setpoint has a `lead`: the driver reads the servo and sends at most one step ahead of that. Where it sent less, the
+   ramp goes on from there.
+4. A setpoint that fails or is superseded ends the ramp, and so does its node when it goes offline. `cut(servo, error)` reports
+   it; the error of the first setpoint goes to the caller instead.
+5. A newer goal replaces the ramp and starts at the last setpoint, where the servo is or is going.
+6. A cycle that comes late is not caught up with: the next setpoint is one whole period later.
 
-The last setpoint of a servo belongs to its record: `begin` is given it, and `sent(servo, setpoint)` reports each new one.
+The last setpoint of a servo belongs to its record: `begin` is given it, and `sent(servo, setpoint)` reports each one that was
+delivered.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import partial
 
 from servobus.engine.coalescer import Ticket
+from servobus.errors import GoalExpired
 from servobus.values import Outcome, ServoGoal
+
+REPLACED = "a setpoint on the way to its goal was replaced before it could leave"
 
 
 @dataclass(slots=True, eq=False)
@@ -29,10 +39,28 @@ class Ramp:
     node: int
     start_within: float
     step: float
-    """Units a cycle, signed."""
+    """Units a cycle."""
     setpoint: float
-    due: float | None = None
-    """When the next setpoint leaves. None: the first was not delivered yet, or the last has left."""
+    """The last one that was delivered; before the first, where the ramp starts."""
+    due: float
+    """When the next setpoint leaves."""
+    under_way: bool = True
+    """A setpoint was made that has not ended."""
+    begun: bool = False
+    """The first setpoint was delivered."""
+
+    def advance(self) -> ServoGoal:
+        """Return the next setpoint, one cycle on; the last one is the goal itself."""
+        target = self.goal.goal.value
+        left = target - self.setpoint
+        value = target if abs(left) <= self.step else self.setpoint + math.copysign(self.step, left)
+        return replace(self.goal, goal=replace(self.goal.goal, value=value), lead=self.step, applied=None, packed=None)
+
+    def delivered(self, setpoint: ServoGoal) -> bool:
+        """Note that a setpoint was delivered; return whether it was the last."""
+        self.begun, self.under_way = True, False
+        self.setpoint = setpoint.goal.value if setpoint.applied is None else setpoint.applied
+        return setpoint.applied is None and self.setpoint == self.goal.goal.value
 
 
 class SetpointRamps:
@@ -51,69 +79,71 @@ class SetpointRamps:
             ramp.step *= self._period / before
 
     def begin(self, ticket: Ticket, speed: float, start: float | None, now: float) -> None:
-        """Ramp this goal's servo from `start` at `speed` (unit/s), instead of to any earlier goal. The ticket then carries the
-        first setpoint. A goal without a start is sent as it is."""
+        """Ramp this goal's servo from `start` at `speed` (unit/s), instead of to any earlier goal.
+
+        The ticket then carries the first setpoint. Without a setpoint to start at, the ramp starts where the goal starts.
+        """
         goal = ticket.goal
-        if start is None:
-            self.drop({ticket.servo})
-            return
-        step = speed * self._period
-        ramp = Ramp(goal, ticket.node, ticket.expires - now, step if goal.goal.value >= start else -step, start)
+        start = goal.start if start is None else start
+        assert start is not None, "a driver that asks for a ramp refuses a goal without a start"
+        ramp = Ramp(goal, ticket.node, ticket.expires - now, speed * self._period, start, now + self._period)
         self.active[ticket.servo] = ramp
-        ticket.goal = _advance(ramp)
-        ticket.done = partial(self._first_ended, ramp, now, ticket.done)
+        ticket.goal = ramp.advance()
+        ticket.done = partial(self._first_ended, ramp, ticket.goal, ticket.done)
 
     def due(self, now: float) -> list[Ticket]:
         """Return the setpoints of this cycle."""
         tickets = []
-        for servo, ramp in self.active.items():
-            if ramp.due is not None and ramp.due <= now:
-                goal = _advance(ramp)
-                last = ramp.setpoint == ramp.goal.goal.value
+        for ramp in self.active.values():
+            if not ramp.under_way and ramp.due <= now:
                 following = ramp.due + self._period
-                ramp.due = None if last else following if following > now else now + self._period
-                tickets.append(Ticket(goal, ramp.node, now + ramp.start_within, partial(self._ended, ramp)))
-                self._sent(servo, ramp.setpoint)
+                ramp.due = following if following > now else now + self._period
+                ramp.under_way = True
+                goal = ramp.advance()
+                ended, gone = partial(self._ended, ramp, goal), partial(self._is_gone, ramp)
+                tickets.append(Ticket(goal, ramp.node, now + ramp.start_within, ended, gone=gone))
         return tickets
 
     def next_due(self) -> float | None:
-        return min((ramp.due for ramp in self.active.values() if ramp.due is not None), default=None)
+        return min((ramp.due for ramp in self.active.values() if not ramp.under_way), default=None)
 
     def drop(self, servos: Collection[str] | None = None) -> None:
         """End the ramps of these servos, or all."""
         for servo in list(self.active) if servos is None else servos:
             self.active.pop(servo, None)
 
+    def end_node(self, node: int, error: Exception) -> None:
+        """End the ramps of a node that went offline. One that has not begun is left to its ticket, which expires."""
+        for ramp in [ramp for ramp in self.active.values() if ramp.node == node and ramp.begun]:
+            self._end(ramp)
+            self._cut(ramp.goal.servo, error)
+
     def _first_ended(
-        self, ramp: Ramp, began: float, done: Callable[[Outcome | Exception], None], result: Outcome | Exception
+        self, ramp: Ramp, setpoint: ServoGoal, done: Callable[[Outcome | Exception], None], result: Outcome | Exception
     ) -> None:
         """The caller's ticket has ended: the other setpoints follow if it was delivered and was not the last."""
-        delivered = isinstance(result, Outcome) and result is not Outcome.SUPERSEDED
-        if delivered:
-            self._sent(ramp.goal.servo, ramp.setpoint)
-        if delivered and ramp.setpoint != ramp.goal.goal.value:
-            ramp.due = began + self._period
-        else:
+        if not isinstance(result, Outcome) or result is Outcome.SUPERSEDED or self._deliver(ramp, setpoint):
             self._end(ramp)
         done(result)
 
-    def _ended(self, ramp: Ramp, result: Outcome | Exception) -> None:
+    def _ended(self, ramp: Ramp, setpoint: ServoGoal, result: Outcome | Exception) -> None:
         """A later setpoint has ended."""
-        if isinstance(result, Exception) and self._end(ramp):
-            self._cut(ramp.goal.servo, result)
-        elif ramp.due is None:
+        if isinstance(result, Outcome) and result is not Outcome.SUPERSEDED:
+            if self._deliver(ramp, setpoint):
+                self._end(ramp)
+        elif not self._is_gone(ramp):
             self._end(ramp)
+            self._cut(ramp.goal.servo, result if isinstance(result, Exception) else GoalExpired(REPLACED))
 
-    def _end(self, ramp: Ramp) -> bool:
-        """Return False if the ramp was replaced or dropped before."""
-        if self.active.get(ramp.goal.servo) is not ramp:
-            return False
-        del self.active[ramp.goal.servo]
-        return True
+    def _deliver(self, ramp: Ramp, setpoint: ServoGoal) -> bool:
+        last = ramp.delivered(setpoint)
+        self._sent(ramp.goal.servo, ramp.setpoint)
+        return last
 
+    def _is_gone(self, ramp: Ramp) -> bool:
+        """Return whether the ramp was replaced, dropped or has ended."""
+        return self.active.get(ramp.goal.servo) is not ramp
 
-def _advance(ramp: Ramp) -> ServoGoal:
-    """Go one cycle on; the last step ends at the goal itself."""
-    target = ramp.goal.goal.value
-    ramp.setpoint = target if abs(target - ramp.setpoint) <= abs(ramp.step) else ramp.setpoint + ramp.step
-    return replace(ramp.goal, goal=replace(ramp.goal.goal, value=ramp.setpoint))
+    def _end(self, ramp: Ramp) -> None:
+        if not self._is_gone(ramp):
+            del self.active[ramp.goal.servo]

@@ -77,7 +77,69 @@ def test_a_late_cycle_is_not_caught_up_with() -> None:
     assert ticket.goal.goal.value == 20
     assert ticket.expires == 5.2
     assert bench.ramps.due(5.0) == []
+    ticket.done(Outcome.ACKED)
     assert bench.ramps.next_due() == pytest.approx(5.1)
+
+
+def test_no_setpoint_is_made_while_one_is_under_way_and_the_grid_is_kept() -> None:
+    """A servo that does not answer is not run away from, and none of its setpoints is superseded by the next."""
+    bench = Bench()
+    bench.begin(100).done(Outcome.ACKED)
+    (ticket,) = bench.ramps.due(0.1)
+    assert (bench.ramps.due(0.2), bench.ramps.due(0.3), bench.ramps.next_due()) == ([], [], None)
+    ticket.done(Outcome.ACKED)
+    (late,) = bench.ramps.due(0.32)
+    assert late.goal.goal.value == 30, "one step from the last, however long that took"
+    late.done(Outcome.ACKED)
+    assert bench.ramps.next_due() == pytest.approx(0.42)
+
+
+def test_each_setpoint_may_be_one_step_ahead_of_where_the_servo_is_read() -> None:
+    bench = Bench()
+    first = bench.begin(-35)
+    assert first.goal.lead == 10
+    first.done(Outcome.ACKED)
+    (second,) = bench.ramps.due(0.1)
+    assert (second.goal.goal.value, second.goal.lead) == (-20, 10)
+
+
+def test_the_ramp_goes_on_from_where_the_driver_sent_less() -> None:
+    """The servo lags or is blocked: the ramp waits for it, and ends only when the goal itself was sent."""
+    bench = Bench()
+    bench.begin(30).done(Outcome.ACKED)
+    setpoints = []
+    for number in range(1, 9):
+        due = bench.ramps.next_due()
+        if due is None:
+            break
+        (ticket,) = bench.ramps.due(due)
+        setpoints.append(ticket.goal.goal.value)
+        ticket.goal.applied = 10.5 if number < 4 else None
+        ticket.done(Outcome.ACKED)
+        assert bench.setpoint == (10.5 if number < 4 else setpoints[-1])
+    assert setpoints == [20, 20.5, 20.5, 20.5, 30]
+    assert "a" not in bench.ramps.active
+
+
+def test_a_first_setpoint_that_was_sent_nearer_is_not_the_last() -> None:
+    bench = Bench()
+    ticket = bench.begin(10)
+    ticket.goal.applied = 4.0
+    ticket.done(Outcome.ACKED)
+    (following,) = bench.ramps.due(0.1)
+    assert following.goal.goal.value == 10
+
+
+def test_a_ramp_turns_round_where_the_servo_is_read_beyond_its_goal() -> None:
+    """It begins where the servo was sent, and that may not be where it is."""
+    bench = Bench()
+    bench.setpoint = 50.0
+    ticket = bench.begin(20)
+    assert ticket.goal.goal.value == 40
+    ticket.goal.applied = 0.0
+    ticket.done(Outcome.ACKED)
+    (following,) = bench.ramps.due(0.1)
+    assert following.goal.goal.value == 10
 
 
 def test_nothing_follows_before_the_first_was_delivered() -> None:
@@ -102,19 +164,45 @@ def test_a_setpoint_that_fails_ends_the_ramp_and_is_reported() -> None:
     assert len(bench.cuts) == 1
 
 
-def test_a_superseded_setpoint_ends_nothing() -> None:
+def test_a_setpoint_that_was_superseded_by_no_goal_of_a_caller_ends_the_ramp_and_is_reported() -> None:
     bench = Bench()
     bench.begin(50).done(Outcome.ACKED)
     (ticket,) = bench.ramps.due(0.1)
     ticket.done(Outcome.SUPERSEDED)
-    assert bench.ramps.next_due() == pytest.approx(0.2)
+    assert bench.ramps.next_due() is None
+    ((servo, error),) = bench.cuts
+    assert servo == "a"
+    assert "replaced before it could leave" in str(error)
+
+
+def test_a_node_that_goes_offline_ends_its_ramps_and_what_waits_is_not_sent() -> None:
+    bench = Bench()
+    bench.begin(50).done(Outcome.ACKED)
+    (waiting,) = bench.ramps.due(0.1)
+    error = ReplyTimeout("offline")
+    bench.ramps.end_node(8, error)
+    assert not waiting.gone(), "another node"
+    bench.ramps.end_node(7, error)
+    assert bench.cuts == [("a", error)]
+    assert waiting.gone()
+    assert bench.ramps.next_due() is None
+
+
+def test_a_ramp_that_has_not_begun_is_left_to_its_ticket() -> None:
+    bench = Bench()
+    ticket = bench.begin(50)
+    bench.ramps.end_node(7, ReplyTimeout("offline"))
+    assert bench.cuts == []
+    ticket.done(Outcome.ACKED)
+    assert [following.goal.goal.value for following in bench.ramps.due(0.1)] == [20]
 
 
 def test_a_newer_goal_goes_on_from_the_last_setpoint() -> None:
     bench = Bench()
     older = bench.begin(50)
     older.done(Outcome.ACKED)
-    bench.ramps.due(0.1)
+    (second,) = bench.ramps.due(0.1)
+    second.done(Outcome.ACKED)
     newer = bench.begin(-50, start=0.0, now=0.15)
     assert newer.goal.goal.value == 10, "from 20, where it was last sent, and not from where it was read"
     assert bench.ramps.due(0.2) == [], "the older ramp has ended"
@@ -139,14 +227,15 @@ def test_a_dropped_ramp_ends_and_the_next_one_starts_at_the_last_setpoint() -> N
     assert bench.ramps.next_due() is None
     late.done(ReplyTimeout("lost"))
     assert bench.cuts == [], "it had ended before"
-    assert bench.begin(50, start=3.0).goal.goal.value == 30, "the record still has the last setpoint"
+    assert bench.begin(50, start=3.0).goal.goal.value == 20, "the record still has the last setpoint that was delivered"
     bench.setpoint = None
     assert bench.begin(50, start=3.0).goal.goal.value == 13
     bench.ramps.drop({"a", "b"})
     assert bench.ramps.next_due() is None
 
 
-def test_a_goal_without_a_start_is_sent_as_it_is() -> None:
+def test_a_second_goal_before_the_first_was_delivered_starts_where_the_goal_starts() -> None:
+    """No setpoint was sent yet: a goal that was sent as it is would let the servo go there as fast as it can."""
     bench = Bench()
-    assert bench.begin(50, start=None).goal.goal.value == 50
-    assert bench.ramps.next_due() is None
+    bench.begin(50, start=0.0)
+    assert bench.begin(-50, start=2.0).goal.goal.value == -8
