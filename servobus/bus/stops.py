@@ -127,9 +127,10 @@ class Stops:
         return {record.name: reports[record.name] for record in servos}
 
     def _target(self, record: ServoRecord, action: str) -> StopTarget:
+        """Return the target of a stop. A servo that owes to go limp is not held instead."""
         return StopTarget(
             record.name,
-            "limp" if action == "limp" else "hold",
+            "limp" if "limp" in (action, self.owed.get(record.name)) else "hold",
             enabled=record.enabled,
             position=record.estimate(self._parts.clock(), ESTIMATE_AGE),
             setpoint=record.setpoint,

@@ -171,3 +171,24 @@ def test_what_could_not_leave_waits_again_unless_a_newer_goal_has_come() -> None
     again = coalescer.take(0.0, ALL)
     assert again is not None
     assert list(again.tickets) == [newer, group.tickets[1]]
+
+
+def test_a_stream_to_a_dead_servo_hears_that_it_expired() -> None:
+    """Each goal replaces the one before it, and none can leave: from the first one's time on that is the answer."""
+    ended: Ended = []
+    coalescer = Coalescer()
+    for count in range(8):
+        at = count * 0.1
+        coalescer.put(ticket(1, ended, expires=at + 0.25, put_at=at))
+    assert kinds(ended) == [("s1", Outcome.SUPERSEDED)] * 2 + [("s1", GoalExpired)] * 5
+
+
+def test_a_stream_that_leaves_now_and_then_is_superseded_only() -> None:
+    ended: Ended = []
+    coalescer = Coalescer()
+    for count in range(8):
+        at = count * 0.1
+        coalescer.put(ticket(1, ended, expires=at + 0.25, put_at=at))
+        if count % 2:
+            assert coalescer.take(at, ALL) is not None
+    assert kinds(ended) == [("s1", Outcome.SUPERSEDED)] * 4
