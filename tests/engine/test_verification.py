@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from servobus.engine.job import Job, Send
 from servobus.engine.scheduler import PROBE_PAUSE
-from servobus.engine.verification import MAX_AGE, PASS
+from servobus.engine.verification import MAX_AGE, MIN_AGE, PASS
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import run_plan
 from servobus.values import Loss, Outcome
@@ -49,8 +51,8 @@ def test_one_question_verifies_all_servos_of_a_group() -> None:
     for number in (1, 2, 3):
         rig.coalescer.put(ticket(number, ended, batch=1))
     rig.scheduler.goals.verification.confirm("s2", 0.0)
-    assert run(rig.scheduler.next_job(0.01)) == [1, 3], "a reply has shown s2 lately"
-    run(rig.scheduler.next_job(0.02))
+    assert run(rig.scheduler.next_job(0.01)) == [1, 2, 3], "s2 was shown lately; it is asked with the others, for nothing more"
+    assert run(rig.scheduler.next_job(0.02)) == [255]
     assert len(ended) == 3
 
 
@@ -58,9 +60,9 @@ def test_a_servo_that_a_reply_showed_lately_is_not_asked() -> None:
     rig, ended = bench(), []  # type: ignore[var-annotated]
     rig.scheduler.goals.verification.confirm("s1", 1.0)
     rig.coalescer.put(ticket(1, ended, expires=9.0))
-    assert run(rig.scheduler.next_job(1.0 + 0.9 * MAX_AGE)) == [255]
+    assert run(rig.scheduler.next_job(1.0 + 0.9 * MIN_AGE)) == [255]
     rig.coalescer.put(ticket(1, ended, expires=9.0))
-    assert run(rig.scheduler.next_job(1.0 + MAX_AGE)) == [1]
+    assert run(rig.scheduler.next_job(1.0 + MIN_AGE)) == [1]
 
 
 def test_a_servo_that_was_doubtful_is_asked_again() -> None:
@@ -85,9 +87,9 @@ def test_a_slow_turn_of_another_class_costs_no_second_verification() -> None:
     run(rig.scheduler.next_job(0.0))
     rig.scheduler.queue(job(2), 0.0)
     assert isinstance(rig.scheduler.next_job(0.0), Job)
-    assert run(rig.scheduler.next_job(2 * MAX_AGE)) == [255]
+    assert run(rig.scheduler.next_job(4 * MIN_AGE)) == [255]
     rig.coalescer.put(ticket(1, ended, expires=9.0))
-    assert run(rig.scheduler.next_job(2 * MAX_AGE)) == [1], "it counts for one goal"
+    assert run(rig.scheduler.next_job(4 * MIN_AGE)) == [1], "it counts for one goal"
 
 
 def test_a_verification_that_no_goal_used_counts_no_longer() -> None:
@@ -105,3 +107,13 @@ def test_a_verification_without_a_reply_lets_nothing_pass() -> None:
     assert isinstance(check.begin(), Send)
     check.fail(ReplyTimeout("no answer"))
     assert run(rig.scheduler.next_job(PROBE_PAUSE)) == [1]
+
+
+def test_on_a_slow_line_servos_are_verified_less_often() -> None:
+    rig, ended = bench(), []  # type: ignore[var-annotated]
+    for begun in (0.0, 1.0):
+        rig.coalescer.put(ticket(1, ended, expires=9.0))
+        run(rig.scheduler.next_job(begun))
+        assert run(rig.scheduler.next_job(begun + 0.03)) == [255]
+    assert rig.scheduler.goals.verification.max_age == pytest.approx(0.15)
+    assert rig.scheduler.goals.verification.max_age <= MAX_AGE
