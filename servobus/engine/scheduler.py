@@ -241,7 +241,7 @@ class Scheduler:
     def node_changed(self, node: Node) -> None:
         """Park the jobs of a node that went offline, and end its ramps; serve the parked jobs of one that came back."""
         if node.health is OFFLINE:
-            self.ramps.end_node(node.id, ReplyTimeout(NODE_OFFLINE))
+            self.goals.ramps.end_node(node.id, ReplyTimeout(NODE_OFFLINE))
             went = node.next_probe - node.backoff
             jobs = self.requests.remove(lambda job: job.node == node.id and not job.even_if_offline)
             self._park(jobs, went + node.reply_allowance_s)
