@@ -17,18 +17,28 @@ FOREIGN = (
     "NOTIFY_SOCKET",
     "NO_COLOR",
     "RUNTIME_DIRECTORY",
+    "SERVOBUS_CA_FILE",
     "SERVOBUS_CONFIG",
+    "SERVOBUS_SOCKET",
+    "SERVOBUS_TOKEN_FILE",
     "WATCHDOG_PID",
     "WATCHDOG_USEC",
 )
 """Variables of the caller that would change what a command does."""
 
+SYSTEM_SOCKET = Path("/run/servobus/servobus.sock")
 NUMBERS = count()
 """One folder a test, with a short name: the path of a Unix socket has at most 107 bytes."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--no-skips", action="store_true", help="a skipped test fails the run")
+
+
+def pytest_sessionstart() -> None:
+    """The system's daemon cannot be hidden from commands that look for one, and tests would move its servos."""
+    if SYSTEM_SOCKET.exists():
+        pytest.exit(f"a servobus daemon of this machine has {SYSTEM_SOCKET}: stop it before the tests", returncode=2)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -55,7 +65,6 @@ def isolate(patch: pytest.MonkeyPatch, folder: Path) -> None:
     for name in FOREIGN:
         patch.delenv(name, raising=False)
     patch.setenv("XDG_RUNTIME_DIR", str(folder))
-    patch.setenv("SERVOBUS_SOCKET", str(folder / "servobus.sock"))
 
 
 @pytest.fixture(scope="session", autouse=True)

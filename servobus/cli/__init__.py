@@ -75,9 +75,10 @@ class Commands(click.Group):
 def cli() -> None:
     """servobus owns a robot's serial lines and gives many callers safe access to many servos.
 
-    A command on servos talks to the running daemon. Without one it opens the ports of a config itself: -c CONFIG, else
-    SERVOBUS_CONFIG, else ./servobus.yaml. Positions are in each servo's unit (degrees if the config names none), speeds in
-    unit/s, times in seconds.
+    A command on servos talks to the daemon that --socket or SERVOBUS_SOCKET names, else to the one at the usual place. Where
+    there is none it opens the ports of a config itself: -c CONFIG, else SERVOBUS_CONFIG, else ./servobus.yaml. It never does so
+    because a daemon that was named does not answer, or has died. Positions are in each servo's unit (degrees if the config names
+    none), speeds in unit/s, times in seconds.
 
     \b
     Exit status:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import click
 
 import servobus
+from servobus.rpc.socket_path import VARIABLE
 
 F = TypeVar("F", bound=Callable[..., Any])
 R = TypeVar("R")
@@ -38,6 +39,10 @@ class Options:
     trace: bool
     dry_run: bool
     direct: bool = False
+    socket: str | None = None
+    """Address of the daemon that was named, by --socket or SERVOBUS_SOCKET."""
+    given: bool = False
+    """The config was given by -c, not by the environment."""
     parsed: Any = None  # a Config to use instead of a file
 
 
@@ -93,12 +98,27 @@ def servo_options(command: F) -> F:
     @json_option
     @click.option("--trace", is_flag=True, help="Print every frame, sent and received, on standard error.")
     @click.option("--dry-run", is_flag=True, help="Open no port: use simulated servos, and print what would be sent.")
-    @click.option("--direct", is_flag=True, help="Open the ports in this process even if a daemon runs.")
+    @click.option("--direct", is_flag=True, help="Open the ports in this process even if a daemon runs, or was named.")
+    @click.option(
+        "--socket",
+        envvar=VARIABLE,
+        metavar="PATH|tcp://HOST:PORT",
+        help="The daemon to use. If it does not answer, the command fails. Default: a daemon at the usual place.",
+    )
     @functools.wraps(command)
-    def wrapper(config: str | None, as_json: bool, trace: bool, dry_run: bool, direct: bool, **arguments: Any) -> Any:
-        return command(options=Options(config, as_json, trace, dry_run, direct), **arguments)
+    def wrapper(
+        config: str | None, as_json: bool, trace: bool, dry_run: bool, direct: bool, socket: str | None, **arguments: Any
+    ) -> Any:
+        if direct and _given("socket"):
+            raise click.UsageError("--socket names a daemon, and --direct asks for none: give one of them")
+        return command(options=Options(config, as_json, trace, dry_run, direct, socket, _given("config")), **arguments)
 
     return wrapper  # type: ignore[return-value]
+
+
+def _given(parameter: str) -> bool:
+    """Whether a person wrote the option on this command line."""
+    return click.get_current_context().get_parameter_source(parameter) is click.core.ParameterSource.COMMANDLINE
 
 
 def on_rig(

@@ -13,7 +13,7 @@ from servobus.cli.logs import SafeStream
 from servobus.cli.options import BusFacts, Options, RigContext
 from servobus.cli.output import echo
 from servobus.config.loader import Config, load_config
-from servobus.errors import ConfigError, DeviceError, LinkDown, PortBusy
+from servobus.errors import ConfigError, DeviceError, PortBusy, ServobusError
 from servobus.protocols.registry import PROTOCOLS
 from servobus.remote.rig import connect
 from servobus.rig.interface import full_name
@@ -56,7 +56,7 @@ async def open_own(
                 on_exit = {name: config.buses[bus].servos[servo].on_exit for name, (bus, servo) in config.names.items()}
                 yield RigContext(rig, lambda: _buses_of(config), on_exit)
     except PortBusy as error:
-        raise await _with_hint(error) from None
+        raise await _with_hint(error, options.socket or find_socket()) from None
     if doubtful := [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]:
         raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; check the servo before you touch it")
 
@@ -65,15 +65,14 @@ async def _buses_of(config: Config) -> Mapping[str, BusFacts]:
     return {name: BusFacts(bus.protocol, bus.port, bool(bus.poll.rates())) for name, bus in config.buses.items()}
 
 
-async def _with_hint(error: PortBusy) -> PortBusy:
+async def _with_hint(error: PortBusy, daemon: str | Path | None) -> PortBusy:
     """The same error, with the next step where the daemon holds the port."""
-    path = find_socket()
-    if path is None:
+    if daemon is None:
         return error
     try:
-        async with connect(path) as rig:
+        async with connect(daemon) as rig:
             pid = (await rig.call("hello")).pid
-    except LinkDown:
+    except ServobusError:
         return error
     hint = f"{error.message}; the servobus daemon (pid {pid}) owns it: leave --direct out, or stop the daemon"
     return PortBusy(hint, bus=error.bus)

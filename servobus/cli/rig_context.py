@@ -1,4 +1,4 @@
-"""How a command gets a rig: that of the running daemon, else one of its own.
+"""How a command gets a rig: that of the daemon, else one of its own where no daemon was named or has died.
 
 What a rig of its own needs (`own_rig`) is imported when there is no daemon, so that `servobus stop` reaches a daemon soon.
 """
@@ -13,8 +13,9 @@ from typing import Any
 
 from servobus.cli.options import BusFacts, Options, RigContext
 from servobus.errors import LinkDown, NotSupported
+from servobus.remote.address import NoDaemon
 from servobus.remote.rig import RemoteRig, connect
-from servobus.rpc.socket_path import find_socket
+from servobus.rpc.socket_path import VARIABLE, find_socket
 
 TRACE_REFUSED = "a daemon has this bus, and --trace shows only the frames of this process: stop the daemon, or omit --trace"
 
@@ -54,14 +55,20 @@ async def open_context(
 
 
 async def _connect(stack: AsyncExitStack, options: Options) -> RemoteRig | None:
-    """The running daemon. Where a config is named, only a daemon that has a bus of that config."""
-    path = None if options.direct or options.dry_run else find_socket()
-    if path is None:
+    """The daemon; None: the command opens ports of its own. Where a config is named, only a daemon that has a bus of that config.
+
+    A daemon that was named and does not answer never becomes ports of this process: they would be those of another rig.
+    """
+    address = None if options.direct or options.dry_run else options.socket or find_socket()
+    if address is None:
         return None
     try:
-        rig = await stack.enter_async_context(connect(path, name=f"servobus {' '.join(sys.argv[1:2])} ({os.getpid()})"))
-    except LinkDown:
-        return None  # the socket is left over from a daemon that ended
+        rig = await stack.enter_async_context(connect(address, name=f"servobus {' '.join(sys.argv[1:2])} ({os.getpid()})"))
+    except LinkDown as error:
+        if options.given and not options.socket and isinstance(error, NoDaemon):
+            return None  # the socket is left over from a daemon that has died, and the config says whose ports
+        others = f"name another one (--socket, {VARIABLE})" if options.socket else "say which ports are meant (-c CONFIG)"
+        raise LinkDown(f"{error.message}; or {others}, or open the ports in this process (--direct); nothing was sent") from None
     if options.config is not None:
         from servobus.cli.own_rig import config_of
 

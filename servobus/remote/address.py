@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import ssl
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,11 +12,15 @@ from urllib.parse import urlsplit
 
 from servobus.errors import AccessDenied, ConfigError, LinkDown
 from servobus.remote.connection import DaemonConnection
-from servobus.rpc.socket_path import find_socket, socket_path
+from servobus.rpc.socket_path import find_socket, named_daemon, socket_path
 from servobus.values import is_loopback
 
 CONNECT_TIMEOUT = 5.0  # seconds for the connection to open
 MAX_TOKEN = 4096
+
+
+class NoDaemon(LinkDown):
+    """Nobody listens at the address: no daemon was started there, or it has died."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,7 @@ class Address:
         except ssl.SSLError as error:
             raise LinkDown(f"{self}: no TLS with the daemon ({error.reason or error}): check its certificate and `tls`") from None
         except (FileNotFoundError, ConnectionRefusedError):
-            raise LinkDown(f"no daemon listens at {self}: start it: servobus run CONFIG") from None
+            raise NoDaemon(f"no daemon listens at {self}: start it: servobus run CONFIG") from None
         except TimeoutError:
             raise LinkDown(f"{self} does not take the connection within {CONNECT_TIMEOUT:g} s: is its daemon stopped?") from None
         except OSError as error:
@@ -51,8 +56,11 @@ class Address:
 
 
 def address_of(address: str | Path | None, tls: bool | str | Path | ssl.SSLContext) -> Address:
-    """The address that a person wrote, or the usual one. Raises ConfigError."""
-    text = str((find_socket() or socket_path()) if address is None else address)
+    """The address that a person wrote, else the one that SERVOBUS_SOCKET names, else the usual one. Raises ConfigError.
+
+    A TCP address without `tls` is asked by the certificates of SERVOBUS_CA_FILE, where that is set.
+    """
+    text = str(address or named_daemon() or find_socket() or socket_path())
     if "://" not in text:
         if tls:
             raise ConfigError(f"{text}: a Unix socket has no TLS: leave `tls` away, or connect to tcp://host:port")
@@ -64,8 +72,10 @@ def address_of(address: str | Path | None, tls: bool | str | Path | ssl.SSLConte
         raise ConfigError(f"{text}: {error}: write tcp://host:port") from None
     if url.scheme != "tcp" or not host or not port or url.path or url.query or url.username:
         raise ConfigError(f"{text} is no address of a daemon: write the path of its socket, or tcp://host:port")
+    tls = tls or os.environ.get("SERVOBUS_CA_FILE") or False
     if not tls and not is_loopback(host):
-        raise ConfigError(f"{text} is another machine, and the token would be readable on the way: give tls=True or its CA file")
+        readable = "the token would be readable on the way"
+        raise ConfigError(f"{text} is another machine, and {readable}: give tls=True, or its CA file (SERVOBUS_CA_FILE)")
     return Address(host=host, port=port, tls=_context(tls) if tls else None)
 
 
@@ -79,10 +89,14 @@ def _context(tls: bool | str | Path | ssl.SSLContext) -> ssl.SSLContext:
 
 
 def token_of(token: str | None, token_file: str | Path | None) -> str | None:
-    """The token; a file is read again at each connection, so that a token may change. Raises ConfigError."""
+    """The token, else that of a file, else that of SERVOBUS_TOKEN_FILE. Raises ConfigError.
+
+    A file is read again at each connection, so that a token may change.
+    """
     if token is not None and token_file is not None:
         raise ConfigError("give a token or a token_file, not both")
-    if token_file is None:
+    token_file = token_file or os.environ.get("SERVOBUS_TOKEN_FILE")
+    if token is not None or not token_file:
         return token
     try:
         with Path(token_file).open("rb") as file:

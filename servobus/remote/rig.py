@@ -67,8 +67,8 @@ async def connect(
         address: Path of the daemon's socket, or tcp://host:port; None: SERVOBUS_SOCKET or the usual place.
         name: What other clients read when this one holds a servo.
         token: The token of a TCP daemon.
-        token_file: The file that holds it; it is read again for each connection.
-        tls: True, the PEM file that signs the daemon's certificate, or an SSL context.
+        token_file: The file that holds it; it is read again for each connection. Neither: the file SERVOBUS_TOKEN_FILE.
+        tls: True, the PEM file that signs the daemon's certificate, or an SSL context. False: SERVOBUS_CA_FILE, where it is set.
         refresh_hz: How often the daemon sends states for `snapshot`, 0.1 to 200 times a second.
 
     Returns: A context manager whose value is a RemoteRig.

@@ -25,6 +25,17 @@ def test_the_path(environ: dict[str, str], path: str) -> None:
     assert socket_path(environ) == Path(path)
 
 
+def test_a_daemon_does_not_listen_at_an_address_that_is_for_clients() -> None:
+    with pytest.raises(ConfigError, match=r"listens at a path; unset it, and use `door: tcp:`"):
+        socket_path({"SERVOBUS_SOCKET": "tcp://127.0.0.1:7337"})
+
+
+def test_the_named_daemon_comes_before_the_usual_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for named in ("/a/b.sock", "tcp://127.0.0.1:7337"):
+        monkeypatch.setenv("SERVOBUS_SOCKET", named)
+        assert str(address_of(None, tls=False)) == named
+
+
 def test_addresses() -> None:
     assert str(address_of("/run/x.sock", tls=False)) == "/run/x.sock"
     assert address_of(Path("x"), tls=False).path == Path("x")
