@@ -21,6 +21,12 @@ PAUSE = 1.0
 """Seconds between two attempts to identify a servo that answers other requests, but not that one."""
 
 
+ENERGISED = (
+    "its torque is on, and servobus did not switch it on: it holds or goes on to a goal of another program; `stop` holds it, "
+    "`disable` makes it limp"
+)
+
+
 class Discovery:
     """Who is there, once for each node: what one servo tells of its node holds for the others of that node."""
 
@@ -71,7 +77,8 @@ class Discovery:
         if isinstance(result, Exception):
             return
         if record.identity != result:
-            for note in result.notes:
+            energised = (ENERGISED,) if result.energised and not record.touched else ()
+            for note in (*result.notes, *energised):
                 self._parts.emit(EventName.SERVO_NOTE, bus=self._parts.name, servo=record.name, note=note)
         for other in self._parts.on(record.node):
             other.identity = result

@@ -9,8 +9,10 @@ from servobus.engine.scheduler import QUEUE_LIMIT
 from servobus.errors import Overloaded, ReplyTimeout
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.sms.driver import SmsDriver
+from servobus.rig.local import open_rig
 from servobus.values import Change
 from tests.engine.scripted_line import puppet_bus
+from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
 
 
@@ -68,3 +70,18 @@ async def test_a_node_that_comes_back_may_have_restarted() -> None:
         puppet.script = lambda frame: None
         await asyncio.sleep(5)
         assert changes.restarts == [1]
+
+
+@virtual
+async def test_a_servo_that_is_energised_at_the_start_is_named() -> None:
+    async with open_rig(config()) as first:
+        await first.enable("s1")
+        servo = devices(first)[1]
+        events = first.events()
+        bus = first.buses["arm"]
+        bus.records["s1"].touched, bus.records["s1"].identity = False, None
+        await bus.identify("s1")
+        event = await anext(events)
+        assert (event.name, event.fields["servo"]) == ("servo_note", "s1")
+        assert "torque is on" in event.fields["note"]
+        assert servo.get("torque_enable") == 1, "nothing was written"
