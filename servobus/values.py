@@ -50,8 +50,8 @@ class EventName(Described):
     PARK_UNCONFIRMED = "park_unconfirmed", "A servo was to be parked, and it is not confirmed that it was.", "bus servo detail"
     EXIT_UNCONFIRMED = "exit_unconfirmed", "What `on_exit` asks for is not confirmed.", "bus servo action detail"
     ESTOP = "estop", "The e-stop was asked for; it is latched.", ""
-    ESTOP_CLEARED = "estop_cleared", "The e-stop was released.", ""
-    RELOADED = "reloaded", "The config was read again: these buses are new, changed or gone.", "added changed removed"
+    ESTOP_CLEARED = "estop_cleared", "The e-stop was released; these servos still owe a stop.", "owed"
+    RELOADED = "reloaded", "The config was read again: what became of the buses that differ.", "added changed removed updated"
     LEASE_LOST = "lease_lost", "A client lost its motion leases; its servos do their `on_lost_client`.", "client servos reason"
     DAEMON_LOST = "daemon_lost", "The connection to the daemon ended (seen by this client alone).", "reason"
     DAEMON_BACK = "daemon_back", "The connection to the daemon is back (seen by this client alone).", ""
@@ -220,11 +220,13 @@ class Reload:
         added: Buses that are new.
         changed: Buses that were left as at exit and opened again; their servos are not enabled.
         removed: Buses that are gone.
+        updated: Buses that go on without a pause, with new rates, limits, speeds or policies.
     """
 
     added: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
+    updated: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,6 +155,8 @@ def stop(options: Options) -> int:
 def clear(options: Options) -> None:
     """Release the e-stop of a daemon. Moves nothing.
 
+    Names the servos that have not confirmed their stop. The daemon goes on to stop them as soon as they answer.
+
     Example: servobus clear
     """
 
@@ -164,10 +166,12 @@ def clear(options: Options) -> None:
 
     async def action(context: RigContext) -> None:
         latched = context.rig.stopped
-        await context.rig.clear()
+        owed = await context.rig.clear()
         if options.as_json:
-            emit({"released": latched})
-        else:
-            echo("the e-stop is released: enable and move again" if latched else "no e-stop was latched")
+            emit({"released": latched, "owed": owed})
+            return
+        echo("the e-stop is released: enable and move again" if latched else "no e-stop was latched")
+        if owed:
+            echo(f"still owed: the stop of {', '.join(owed)}, which is repeated until it is confirmed", err=True)
 
     on_rig(options, action, before=refuse)

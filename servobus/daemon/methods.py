@@ -94,8 +94,8 @@ def scan(services: Services, client: Client, params: Any) -> Any:
     return services.rig.scan(params.bus, baudrates=params.baudrates, ids=params.ids, progress=report)
 
 
-async def reload(services: Services, _: Client, __: Nothing) -> Any:
-    report = await services.rig.reload()
+async def reload(services: Services, _: Client, params: Any) -> Any:
+    report = await services.rig.reload(force=params.force)
     services.leases.forget_removed()
     return report
 

@@ -303,8 +303,8 @@ class RemoteRig(Rig):
     async def stop(self) -> dict[str, StopReport]:
         return cast("dict[str, StopReport]", await self._call("stop", {}, partial(self._latch, True)))
 
-    async def clear(self) -> None:
-        await self._call("clear", {}, partial(self._latch, False))
+    async def clear(self) -> tuple[str, ...]:
+        return cast("tuple[str, ...]", await self._call("clear", {}, partial(self._latch, False)))
 
     def _latch(self, stopped: bool, result: T) -> T:
         self._cache.stopped = stopped
@@ -361,8 +361,8 @@ class RemoteRig(Rig):
             self._scans.pop(bus, None)
         return hits
 
-    async def reload(self) -> Reload:
-        report: Reload = await self._session.call("reload", {})
+    async def reload(self, *, force: bool = False) -> Reload:
+        report: Reload = await self._session.call("reload", {"force": force})
         await self._rename()
         await self._refresh_after("reload")
         return report

@@ -224,8 +224,10 @@ class Rig(ABC):
         """
 
     @abstractmethod
-    async def clear(self) -> None:
-        """Release the e-stop. Nothing moves by it. Raises Busy while servos are still being stopped or parked."""
+    async def clear(self) -> tuple[str, ...]:
+        """Release the e-stop. Nothing moves by it. Raises Busy while servos are still being stopped or parked.
+
+        Returns: Full names of the servos that have not confirmed their stop: they are stopped as soon as they answer."""
 
     @abstractmethod
     async def settle(self, *names: str, tolerance: float | None = None, timeout: float = 10.0) -> Snapshot:
@@ -385,8 +387,13 @@ class Rig(ABC):
         """
 
     @abstractmethod
-    async def reload(self) -> Reload:
-        """Read the config file again, all of it or nothing. Unchanged buses go on; a changed or removed one is left as at exit.
+    async def reload(self, *, force: bool = False) -> Reload:
+        """Read the config file again, all of it or nothing. A bus that is removed, or cannot go on, is left as at exit.
 
-        Raises: ConfigError, NotSupported (the rig was not opened from a file), Busy.
+        A bus whose line, servos, ids, models and calibration are the same takes new rates, limits, speeds and policies at once.
+
+        Args:
+            force: True: also while a servo of a bus that cannot go on is enabled or owes a stop; False: that is refused.
+
+        Raises: ConfigError, NotSupported (the rig was not opened from a file), Busy (names the servos; nothing has changed).
         """

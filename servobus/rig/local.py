@@ -96,20 +96,30 @@ class LocalRig(Rig):
     async def release(self, *names: str) -> None:
         self.full_names(names)
 
-    async def reload(self) -> Reload:
+    async def reload(self, *, force: bool = False) -> Reload:
         if self.path is None:
             raise NotSupported("this rig was not opened from a file, so there is none to read again")
         config = load_config(self.path)  # an invalid file raises here, before anything has changed
         if self._reloading is not None and not self._reloading.done():
             raise Busy("the config is being read again already: wait until that is done")
-        self._reloading = asyncio.create_task(self._reload(config))
+        self._reloading = asyncio.create_task(self._reload(config, force))
         return await asyncio.shield(self._reloading)  # a caller that is cancelled does not stop it half-way
 
-    async def _reload(self, config: Config) -> Reload:
+    async def _reload(self, config: Config, force: bool) -> Reload:
         await asyncio.gather(*self._stopping)
         wanted = [name for name in config.buses if not self._only or name in self._only]
-        kept = {name for name in self.supervisors if name in wanted and config.has_same(name, self.config)}
+        same = [name for name in wanted if name in self.buses and config.has_same_line(name, self.config)]
+        differing = [name for name in same if config.buses[name] != self.config.buses[name]]
+        updated = tuple(name for name in differing if self.buses[name].use_options(config.buses[name]))
+        kept = {name for name in same if name in updated or name not in differing}
         gone = {name: supervisor for name, supervisor in self.supervisors.items() if name not in kept}
+        if not force and (busy := [name for bus in gone.values() for name in bus.in_use()]):
+            for name in updated:
+                self.buses[name].use_options(self.config.buses[name])
+            what = f"the new config closes or opens again {', '.join(gone)}"
+            raise Busy(
+                f"{what}, while these servos are enabled or owe a stop: {', '.join(busy)}; disable them first, or force it"
+            )
         self.left.update(await self._leave(gone.values()))
         await asyncio.gather(*map(self._end, gone.values()))
         latched = self.stopped
@@ -121,7 +131,7 @@ class LocalRig(Rig):
             self.buses[name].stops.latched = latched
             self._group.start_soon(self.supervisors[name].run, True)
         added, changed = (tuple(name for name in new if (name in gone) is again) for again in (False, True))
-        report = Reload(added, changed, tuple(name for name in gone if name not in wanted))
+        report = Reload(added, changed, tuple(name for name in gone if name not in wanted), updated)
         self._event(EventName.RELOADED, **asdict(report))
         return report
 
@@ -195,12 +205,14 @@ class LocalRig(Rig):
         task.add_done_callback(self._stopping.discard)
         return task
 
-    async def clear(self) -> None:
+    async def clear(self) -> tuple[str, ...]:
         if self._stopping:
             raise Busy("servos are still being stopped or parked: clear when they are at rest")
         for bus in self.buses.values():
             bus.stops.latched = False
-        self._event(EventName.ESTOP_CLEARED)
+        owed = tuple(f"{name}/{servo}" for name, bus in self.buses.items() for servo in bus.stops.owed)
+        self._event(EventName.ESTOP_CLEARED, owed=owed)
+        return owed
 
     @property
     def stopped(self) -> bool:

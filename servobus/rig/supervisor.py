@@ -82,6 +82,12 @@ class BusSupervisor:
         """The enabled servos whose `policy` (on_estop, on_exit, on_lost_client) is this kind."""
         return [record for record in self.bus.records.values() if record.enabled and getattr(record.options, policy) == kind]
 
+    def in_use(self) -> list[str]:
+        """Full names of the servos that are enabled, or are being enabled, or owe a stop."""
+        bus = self.bus
+        used = [name for name, record in bus.records.items() if record.enabled or name in {*bus.motion.enabling, *bus.stops.owed}]
+        return [f"{self.name}/{name}" for name in used]
+
     async def park(self, record: ServoRecord) -> StopReport:
         """Move a servo to its park pose, then switch its torque off, also when it does not get there in time."""
         report = await self.bus.motion.park(record.name)

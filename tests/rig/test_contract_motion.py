@@ -264,7 +264,7 @@ async def test_reading_the_config_anew(over: Over, tmp_path: Path) -> None:
         assert await rig.reload() == Reload()
         two_buses(tmp_path, ", s3: {id: 3, model: sts}", leg=4)
         report = await rig.reload()
-        assert asdict(report) == {"added": (), "changed": ("arm", "leg"), "removed": ()}
+        assert asdict(report) == {"added": (), "changed": ("arm", "leg"), "removed": (), "updated": ()}
         assert list(rig.names) == ["arm/s1", "arm/s2", "arm/s3", "leg/s1"]
         assert list(rig.snapshot()) == list(rig.names)
         await rig["s3"].enable()

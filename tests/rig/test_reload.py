@@ -55,7 +55,7 @@ async def test_a_changed_bus_is_left_as_at_exit_and_the_others_go_on(path: Path)
         await rig.enable()
         old, leg = devices(rig)[1], rig.buses["leg"]
         write(path, TWO.replace("id: 1,", "id: 7,"))
-        assert await rig.reload() == Reload(changed=("arm",))
+        assert await rig.reload(force=True) == Reload(changed=("arm",))
         assert old.get("torque_enable") == 0
         assert rig.left["arm/s1"].confirmed
         assert rig.buses["leg"] is leg
@@ -63,6 +63,44 @@ async def test_a_changed_bus_is_left_as_at_exit_and_the_others_go_on(path: Path)
         await rig.supervisors["arm"].tried.wait()
         assert list(devices(rig)) == [7]
         assert (await rig["s1"].read()).enabled is False
+
+
+@pytest.mark.parametrize("other", [TWO.replace("id: 1,", "id: 7,"), TWO.replace("arm:", "hip:"), TWO.replace("{s1:", "{s9:")])
+@virtual
+async def test_a_bus_with_an_enabled_servo_is_neither_opened_again_nor_removed(path: Path, other: str) -> None:
+    async with open_rig(path) as rig:
+        await rig.enable()
+        before, old = dict(rig.buses), devices(rig)[1]
+        write(path, other)
+        with pytest.raises(
+            Busy, match=r"opens again arm, while these servos are enabled.*: arm/s1; disable them first, or force"
+        ):
+            await rig.reload()
+        assert rig.buses == before
+        assert old.get("torque_enable") == 1
+        assert rig.snapshot()["arm/s1"].enabled
+        await rig.disable("arm/s1")
+        report = await rig.reload()
+        assert (*report.changed, *report.removed) == ("arm",)
+        assert rig.buses["leg"] is before["leg"]
+        assert rig.snapshot()["leg/s2"].enabled
+
+
+@virtual
+async def test_a_bus_that_owes_a_stop_is_not_opened_again(path: Path) -> None:
+    async with open_rig(path) as rig:
+        await rig.enable()
+        device = devices(rig)[1]
+        device.dead = True
+        await rig.stop()
+        assert await rig.clear() == ("arm/s1",)
+        device.dead = False
+        write(path, TWO.replace("id: 1,", "id: 7,"))
+        with pytest.raises(Busy, match="owe a stop: arm/s1"):
+            await rig.reload()
+        await asyncio.sleep(3)
+        await rig.disable("arm/s1")
+        assert await rig.reload() == Reload(changed=("arm",))
 
 
 @virtual
@@ -110,7 +148,7 @@ async def test_one_at_a_time_and_to_its_end(path: Path) -> None:
     async with open_rig(path) as rig:
         await rig.enable()
         write(path, TWO.replace("id: 1,", "id: 7,"))
-        first = asyncio.create_task(rig.reload())
+        first = asyncio.create_task(rig.reload(force=True))
         await asyncio.sleep(0)
         with pytest.raises(Busy, match="already"):
             await rig.reload()
@@ -126,7 +164,7 @@ async def test_left_while_the_config_is_read_anew(path: Path) -> None:
     async with open_rig(path) as rig:
         await rig.enable()
         write(path, TWO.replace("id: 1,", "id: 7,"))
-        reloading = asyncio.create_task(rig.reload())
+        reloading = asyncio.create_task(rig.reload(force=True))
         await asyncio.sleep(0)
     assert await reloading == Reload(changed=("arm",))
     assert {name: report.confirmed for name, report in rig.left.items()} == {"arm/s1": True, "leg/s2": True}
