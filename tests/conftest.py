@@ -43,7 +43,7 @@ def pytest_sessionstart() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Python up to 3.11.8 fails with a SystemError when garbage is collected while the source of a test is parsed."""
+    """Collect no garbage meanwhile: see `tests/__main__.py`."""
     gc.disable()
     try:
         return (yield)
