@@ -7,7 +7,7 @@ the frames are, so nothing here knows a protocol.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from servobus.engine.health import FIRST_ALLOWANCE
@@ -41,7 +41,7 @@ class Bandwidth:
 def line_bandwidth(options: BusOptions, driver: Driver, traits: LineTraits) -> Bandwidth:
     """Goals of all servos at the bus's `goal_rate`, polls at theirs."""
     driver.use_traits(traits)
-    goals = driver.preview_goals([ServoGoal(name, _any_goal(servo), 0.0) for name, servo in options.servos.items()])
+    goals = driver.preview_goals([_any_goal(name, servo, driver) for name, servo in options.servos.items()])
     stop = driver.preview_stop([StopTarget(name, "hold", enabled=True, position=0.0) for name in driver.nodes])
     shares = {"goals": 100 * options.rate_of_goals * _seconds(goals, traits)}
     longest = max((_seconds([request], traits) for request in goals), default=0.0)
@@ -73,6 +73,7 @@ def _seconds(requests: Sequence[Request[Any]], traits: LineTraits) -> float:
     )
 
 
-def _any_goal(servo: ServoOptions) -> Goal:
-    """A goal inside the servo's limits."""
-    return Goal("position", sum(servo.limits) / 2 if servo.limits else 0.0)
+def _any_goal(name: str, servo: ServoOptions, driver: Driver) -> ServoGoal:
+    """A goal inside the servo's limits; one setpoint of it where the host keeps the speed."""
+    goal = ServoGoal(name, Goal("position", sum(servo.limits) / 2 if servo.limits else 0.0), 0.0)
+    return replace(goal, lead=driver.host_speed(goal))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, cast
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -63,6 +63,12 @@ class FaultOptions(Data):
 
 class ServoOptions(Data):
     """One servo of any bus."""
+
+    live: ClassVar[frozenset[str]] = frozenset(
+        {"limits", "on_limit", "speed", "max_speed", "max_step", "acceleration", "torque_limit", "ttl", "allow_max_speed"}
+        | {"on_estop", "on_exit", "on_lost_client", "park_pose", "park_timeout"}
+    )
+    """Keys that a running bus takes when the config is read again."""
 
     id: int
     """Id of the servo's node on the line."""
@@ -145,6 +151,9 @@ class PollRates(Data):
 class BusOptions(Data):
     """One bus of any protocol. `protocol` and `servos` are narrowed by each."""
 
+    live: ClassVar[frozenset[str]] = frozenset({"poll", "goal_rate"})
+    """Keys that a running bus takes when the config is read again, beside those of its servos."""
+
     protocol: str
     """Protocol of the servos on the line."""
     port: Annotated[str, Field(min_length=1, max_length=255)]
@@ -178,6 +187,24 @@ class BusOptions(Data):
         """On four wires: seconds by which the pauses before the replies of two servos may differ. None: half duplex."""
         return None
 
+    def is_live_change(self, other: BusOptions) -> bool:
+        """Return whether a running bus with these options can take the others: only rates, limits, speeds and policies differ."""
+        servos, others = _servos_of(self), _servos_of(other)
+        return (
+            _fixed(self) == _fixed(other)
+            and list(servos) == list(others)
+            and all(_fixed(servo) == _fixed(others[name]) for name, servo in servos.items())
+        )
+
     @property
     def rate_of_goals(self) -> float:
         return self.goal_rate or self.poll.feedback or 50.0
+
+
+def _fixed(options: ServoOptions | BusOptions) -> tuple[type, dict[str, object]]:
+    """Return the keys that need the bus to be opened again."""
+    return type(options), options.model_dump(exclude={*options.live, "servos"})
+
+
+def _servos_of(options: BusOptions) -> Mapping[str, ServoOptions]:
+    return cast("Mapping[str, ServoOptions]", vars(options)["servos"])  # each protocol narrows it to its own class

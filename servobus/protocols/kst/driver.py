@@ -1,12 +1,12 @@
 """The KST driver: which requests each verb takes (KST RS422, 3). Sans-IO. Written from the document, not tried on hardware yet.
 
 The protocol has no ping, torque, stop or speed command. So a ping reads the id, `enable` writes nothing and only lets goals pass,
-a stop sends the last setpoint again, and the host keeps the speed (`host_speed`).
+a stop sends a position to hold, and the host keeps the speed (`host_speed`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,14 +15,15 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout,
 from servobus.protocols import fence
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask, single_polls
 from servobus.protocols.kst import goals, identity
-from servobus.protocols.kst.codec import Command, decode_position, version_text
+from servobus.protocols.kst.codec import Command, version_text
 from servobus.protocols.kst.commissioning import KstCommissioning
 from servobus.protocols.kst.model import KstModel
 from servobus.protocols.kst.options import KstBus
+from servobus.protocols.kst.position import locate, position_read
 from servobus.protocols.kst.requests import Fence, Read, RequestSettings
 from servobus.protocols.kst.servo import CalibratedServo
 from servobus.protocols.speed import goal_speed
-from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, Loss, ServoGoal, StopReport, StopTarget, Update
 
 FENCES = (Command.READ_ID, Command.READ_VERSION, Command.READ_STATUS, Command.READ_POSITION)
 """The reads that can be a fence, the preferred one first: its reply also has the servo's id in the data."""
@@ -47,6 +48,14 @@ class KstDriver(Driver):
             (name, part): self._state_read(name, part) for name in self.servos for part in ("feedback", "health")
         }
         self._reads: dict[tuple[str, str, bool], Request[Any]] = {}
+
+    def use_options(self, options: KstBus) -> bool:
+        if not self.options.is_live_change(options):
+            return False
+        self.options = self.commissioning.options = options
+        for name, servo in self.servos.items():
+            servo.use_options(options.servos[name])
+        return True
 
     def step(self, servo: str) -> float:
         return self.servos[servo].calibration.unit_per_step
@@ -82,8 +91,7 @@ class KstDriver(Driver):
         if servo is None or not enabled:
             return True
         try:
-            # Not repeated: nothing would tell the reply to a second read from that to the first.
-            servo.travel.read((yield from ask(Read(self.settings, node, Command.READ_POSITION, decode_position, once=True))))
+            yield from locate(self.settings, servo, once=True)
         except DeviceError:
             return True  # it answers, and does not report its position
         return not servo.travel.jumped
@@ -147,19 +155,19 @@ class KstDriver(Driver):
     # Motion
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Read the position, and write nothing: there is no torque command, and to write a reading that is not the servo's goal
-        would move it."""
-        target = self.servos[servo]
-        raw = yield from ask(Read(self.settings, target.node, Command.READ_POSITION, target.read_steps))
-        self.settings.aborts.faulty.discard(target.node)
-        target.travel.begin(raw)
-        return target.to_unit(raw)
+        return goals.enable(self.settings, self.servos[servo])
 
     def disable(self, servo: str) -> Plan[StopReport]:
         return goals.disable(self.servos[servo])
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
         return goals.stop(self.settings, [(self.servos[target.servo], target) for target in targets])
+
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+        """Read where each servo is: the protocol shows a restart only by that."""
+        for servo in servos:
+            yield from goals.verify(self.settings, self.servos[servo])
+        return {servo: loss for servo in servos if (loss := self.servos[servo].loss) is not None}
 
     def check_goal(self, goal: ServoGoal) -> None:
         if goal.servo not in self.servos:
@@ -174,30 +182,43 @@ class KstDriver(Driver):
         servo.to_raw(goal.goal.value)
         self.host_speed(goal)
 
-    def host_speed(self, goal: ServoGoal) -> float | None:
-        """Return the speed (unit/s) that the host keeps on the way; None: no limit. Left alone, a servo is as fast as it can
-        be."""
+    def host_speed(self, goal: ServoGoal) -> float:
+        """Return the speed (unit/s) that the host keeps on the way: left alone, a servo goes as fast as it can."""
         servo = self.servos[goal.servo]
+        if goal.goal.speed == 0:
+            raise LimitError(
+                "speed 0 means no limit, and the host keeps the speed of a KST servo: give a speed", servo=servo.name
+            )
         speed = goal_speed(goal, servo.options, servo.model_speed)
-        if speed and goal.start is None:
+        if goal.start is None:
             raise LimitError(
                 "its position is not known, so the host cannot keep its speed: read the servo first", servo=servo.name
             )
-        return speed or None
+        return speed
 
     def plan_goals(self, goals_: Sequence[ServoGoal], *, together: bool, confirm: bool) -> Sequence[GoalPlan]:
         """Return one plan for each goal, or one for all. Each goal is confirmed by its reply, with or without `confirm`."""
         return goals.plan_setpoints(self.settings, self._setpoints(goals_), together=together)
 
     def _setpoints(self, goals_: Sequence[ServoGoal]) -> list[goals.Setpoint]:
-        return [(self.servos[goal.servo], self.servos[goal.servo].to_raw(goal.goal.value)) for goal in goals_]
+        return [(self.servos[goal.servo], goal, self.servos[goal.servo].to_raw(goal.goal.value)) for goal in goals_]
 
     def preview_goals(self, goals_: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
-        return [goals.set_position(self.settings, servo, raw) for servo, raw in self._setpoints(goals_)]
+        """Return the frames of each goal; one of a ramp reads the servo first."""
+        frames: list[Request[Any]] = []
+        for servo, goal, raw in self._setpoints(goals_):
+            frames += [] if goal.lead is None else [position_read(self.settings, servo)]
+            frames.append(goals.set_position(self.settings, servo, raw))
+        return frames
 
     def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
+        """Return the read of each servo and the position that it is sent."""
         servos = [self.servos[target.servo] for target in targets]
-        return [goals.set_position(self.settings, servo, servo.range[0]) for servo in servos]
+        makers: tuple[Callable[[CalibratedServo], Request[Any]], ...] = (
+            partial(position_read, self.settings),
+            lambda servo: goals.set_position(self.settings, servo, servo.range[0]),
+        )
+        return [make(servo) for servo in servos for make in makers]
 
     def fault_names(self, servo: str, status: int | None) -> tuple[str, ...]:
         """Return the status bits that the config names, and the faults that the host has found out."""

@@ -1,47 +1,101 @@
 """Goals and stops of KST servos: frames to one servo each, confirmed by a reply that repeats the position.
 
-There is no speed, torque or stop command: the host ramps the setpoints and decides what may be sent, and a stop sends each
-servo's last setpoint again (`CalibratedServo.hold_steps`).
+There is no speed, torque or stop command: the host ramps the setpoints and decides what may be sent. Before each setpoint the
+servo is read, and it is sent at most one step of the ramp ahead of that (`CalibratedServo.ahead`).
+
+A stop has three steps, and each servo that fails one of them is left to the next try of the stop:
+
+1. Read where the servo is.
+2. Send it the position to hold (`CalibratedServo.hold_steps`).
+3. Read it twice, with a pause between: only a servo that rests is confirmed, because the reply repeats what was sent, whatever
+   the servo does.
+
+A servo that does not answer is sent nothing. It goes no farther than its last setpoint, one step of the ramp away, and if it has
+restarted meanwhile, a position would move it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from servobus.errors import ServobusError
+from servobus.errors import DeviceError, NotEnabled, ServobusError
 from servobus.protocols.base import GoalPlan, Plan, ask
 from servobus.protocols.kst.aborts import HardwareFault
 from servobus.protocols.kst.codec import Command, encode_position
-from servobus.protocols.kst.requests import Read, RequestSettings, SetValue, UnansweredCommand
+from servobus.protocols.kst.position import Readings, locate, rest, rests
+from servobus.protocols.kst.requests import RequestSettings, SetValue
 from servobus.protocols.kst.servo import CalibratedServo
-from servobus.values import Outcome, StopReport, StopTarget
+from servobus.values import Outcome, ServoGoal, StopReport, StopTarget
 
-REPEATS = 2
-"""How often an unanswered stop is sent, because a bad line may lose one."""
 HOLDS = "KST has no torque command: the servo keeps holding"
+OFFLINE = "offline: nothing was sent; it goes no farther than its last setpoint"
+NOT_ENABLED = "it was not enabled: servobus does not move it"
+MAX_WAITS = 50
+"""Setpoints in a row that a servo may let pass without coming nearer to the goal that it holds."""
 
 Results = dict[str, Outcome | Exception]
-Setpoint = tuple[CalibratedServo, int]
-"""A servo and its goal in steps."""
+Setpoint = tuple[CalibratedServo, ServoGoal, int]
+"""A servo, its goal, and that in steps."""
 
 
 def plan_setpoints(settings: RequestSettings, setpoints: Sequence[Setpoint], *, together: bool) -> list[GoalPlan]:
     """Return one plan for each setpoint, or one for all."""
     groups = [list(setpoints)] if together and setpoints else [[setpoint] for setpoint in setpoints]
-    return [GoalPlan(tuple(servo.name for servo, _ in group), send_all(settings, group), len(group)) for group in groups]
+    return [GoalPlan(tuple(servo.name for servo, _, _ in group), send_all(settings, group), len(group)) for group in groups]
 
 
 def send_all(settings: RequestSettings, setpoints: Sequence[Setpoint]) -> Plan[Results]:
     """Send setpoints one after the other. A refusal of one servo does not stop the others."""
     results: Results = {}
-    for servo, raw in setpoints:
+    for servo, goal, raw in setpoints:
         try:
             refuse_faulty(settings, servo)
-            yield from send(settings, servo, raw)
+            if goal.lead is None:
+                yield from send(settings, servo, raw)
+            else:
+                yield from lead(settings, servo, goal, raw)
             results[servo.name] = Outcome.ACKED
         except ServobusError as error:
             results[servo.name] = error.at(servo=servo.name)
     return results
+
+
+def lead(settings: RequestSettings, servo: CalibratedServo, goal: ServoGoal, wanted: int) -> Plan[None]:
+    """Read the servo, then send it a setpoint at most one lead ahead, and note that in the goal where it is nearer than wanted.
+
+    It is not read again where a verification has just done that. A servo that lags behind its goal is sent nothing, and one that
+    comes no nearer is given up.
+    """
+    assert goal.lead is not None
+    travel = servo.travel
+    present = travel.last if travel.verified else None
+    travel.verified = False
+    if present is None:
+        present = yield from locate(settings, servo)
+    if travel.jumped:
+        raise NotEnabled(f"it is at {servo.to_unit(present):g}, where it was not sent: it has restarted. Enable it again")
+    servo.begin_lead(goal.lead)
+    raw = servo.ahead(wanted, present)
+    if raw is None:
+        goal.applied = _wait(servo, present)
+        return
+    if raw != wanted:
+        goal.applied = servo.to_unit(raw)
+    yield from send(settings, servo, raw)
+
+
+def _wait(servo: CalibratedServo, present: int) -> float:
+    """Leave a servo its goal, to which it is on its way, and return that. Raises DeviceError where it comes no nearer."""
+    held = servo.travel.held
+    assert held is not None
+    servo.travel.wait(abs(held - present))
+    if servo.travel.waits < MAX_WAITS:
+        return servo.to_unit(held)
+    raise DeviceError(
+        f"it does not follow: it is at {servo.to_unit(present):g} and its goal is {servo.to_unit(held):g}. Is it blocked, or "
+        "overloaded? Enable it again"
+    )
 
 
 def send(settings: RequestSettings, servo: CalibratedServo, raw: int) -> Plan[None]:
@@ -65,46 +119,73 @@ def refuse_faulty(settings: RequestSettings, servo: CalibratedServo) -> None:
         )
 
 
+def verify(settings: RequestSettings, servo: CalibratedServo) -> Plan[None]:
+    """Find out whether the servo is where it was sent. One that cannot be read has shown nothing."""
+    try:
+        yield from locate(settings, servo)
+    except ServobusError:
+        return
+    servo.travel.verified = True
+
+
+def enable(settings: RequestSettings, servo: CalibratedServo) -> Plan[float]:
+    """Read the position, and write nothing: there is no torque command, and to write a reading that is not the servo's goal would
+    move it. Raises DeviceError for a servo that moves."""
+    readings = (yield from rest(settings, [servo]))[servo]
+    if isinstance(readings, ServobusError):
+        raise readings
+    if not rests(readings):
+        raise DeviceError(f"it moves, {_describe(servo, readings)}: enable it when it rests")
+    raw = servo.believe(readings[1], sure=True)
+    settings.aborts.faulty.discard(servo.node)
+    servo.travel.begin(raw)
+    return servo.to_unit(raw)
+
+
 def stop(settings: RequestSettings, targets: Sequence[tuple[CalibratedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
-    """Hold the enabled servos, also those that are to be limp: first those that answer, then those that do not."""
+    """Hold the enabled servos, also those that are to be limp; see above."""
     reports: dict[str, StopReport] = {}
-    silent: list[tuple[CalibratedServo, StopTarget, str]] = []
+    held: list[CalibratedServo] = []
     for servo, target in targets:
         if not target.enabled:
-            reports[servo.name] = StopReport("none", False, True, "it was not enabled: servobus does not move it")
+            reports[servo.name] = StopReport("none", False, True, NOT_ENABLED)
         elif not target.reachable:
-            silent.append((servo, target, "offline: nothing was confirmed"))
+            reports[servo.name] = StopReport("hold", False, False, OFFLINE)
         else:
             try:
                 yield from _hold(settings, servo, target)
-                reports[servo.name] = StopReport("hold", True, True, HOLDS if target.kind == "limp" else "")
+                held.append(servo)
             except ServobusError as error:
-                silent.append((servo, target, str(error)))
-    for servo, target, reason in silent:
-        reports[servo.name] = yield from _hold_unanswered(settings, servo, target, reason)
+                reports[servo.name] = StopReport("hold", False, False, error.message)
+    for servo, readings in (yield from rest(settings, held)).items():
+        reports[servo.name] = _report(servo, readings)
     for servo, target in targets:
         if target.kind == "limp":
             servo.travel.end()
-    return {servo.name: reports[servo.name] for servo, _ in targets}
+    return {servo.name: _with_note(reports[servo.name], target) for servo, target in targets}
 
 
 def _hold(settings: RequestSettings, servo: CalibratedServo, target: StopTarget) -> Plan[None]:
-    """Send the position to hold; read it first where it is not known. A latched hardware fault does not prevent a stop."""
-    if servo.hold_steps(target.setpoint) is None:
-        yield from ask(Read(settings, servo.node, Command.READ_POSITION, servo.read_steps))
+    """Read where it is, and send the position to hold. A latched hardware fault does not prevent a stop."""
+    yield from locate(settings, servo)
     raw = servo.hold_steps(target.setpoint)
     assert raw is not None
     yield from send(settings, servo, raw)
 
 
-def _hold_unanswered(settings: RequestSettings, servo: CalibratedServo, target: StopTarget, reason: str) -> Plan[StopReport]:
-    raw = servo.hold_steps(target.setpoint)
-    if raw is None:
-        return StopReport("hold", False, False, f"{reason}; nothing was written, because its position is not known")
-    servo.travel.send(raw)
-    for _ in range(REPEATS):
-        yield from ask(UnansweredCommand(settings, servo.node, Command.SET_POSITION, encode_position(raw)))
-    return StopReport("hold", True, False, reason)
+def _report(servo: CalibratedServo, readings: Readings) -> StopReport:
+    if isinstance(readings, ServobusError):
+        return StopReport("hold", True, False, f"it was sent the position to hold, and not read again: {readings.message}")
+    confirmed = rests(readings)
+    return StopReport("hold", True, confirmed, "" if confirmed else f"it still moves: {_describe(servo, readings)}")
+
+
+def _describe(servo: CalibratedServo, readings: tuple[int, int]) -> str:
+    return f"it was read at {servo.to_unit(readings[0]):g}, then at {servo.to_unit(readings[1]):g}"
+
+
+def _with_note(report: StopReport, target: StopTarget) -> StopReport:
+    return replace(report, detail=HOLDS) if target.kind == "limp" and report.confirmed and not report.detail else report
 
 
 def disable(servo: CalibratedServo) -> Plan[StopReport]:

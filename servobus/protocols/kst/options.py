@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -16,6 +16,8 @@ ALWAYS_HOLDS = "a KST servo has no torque command and cannot be made limp: it al
 
 
 class KstServo(ServoOptions):
+    live: ClassVar[frozenset[str]] = ServoOptions.live | {"range_deg"}
+
     id: Annotated[int, Field(ge=1, le=255)]
     """1 to 254; 255 only where the bus's id_range has it. 0 is the broadcast id."""
     model: str = "kst"
@@ -38,6 +40,13 @@ class KstServo(ServoOptions):
             raise ValueError("a KST servo has no command for it: take it out")
         return value
 
+    @field_validator("allow_max_speed")
+    @classmethod
+    def _has_no_speed(cls, allowed: bool) -> bool:
+        if allowed:
+            raise ValueError("the host keeps the speed of a KST servo, so it has no speed without a limit: take it out")
+        return allowed
+
     @model_validator(mode="after")
     def _range_ascends(self) -> Self:
         if self.range_deg and self.range_deg[0] >= self.range_deg[1]:
@@ -46,6 +55,8 @@ class KstServo(ServoOptions):
 
 
 class KstBus(BusOptions):
+    live: ClassVar[frozenset[str]] = BusOptions.live | {"status_bits"}
+
     protocol: Literal["kst"]
     baudrate: Annotated[int, Field(ge=300, le=10_000_000)] = 512_000
     """Baud rate of the servos, in bits/s."""

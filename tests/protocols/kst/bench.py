@@ -10,7 +10,7 @@ from hypothesis import settings
 
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
-from servobus.protocols.kst.codec import Frame, KstCodec, encode
+from servobus.protocols.kst.codec import Command, Frame, KstCodec, encode, encode_position
 from servobus.protocols.kst.driver import KstDriver
 from servobus.protocols.kst.model import KstModel, packaged_model
 from servobus.protocols.kst.options import KstBus
@@ -42,7 +42,8 @@ def changed_model(**parts: Any) -> KstModel:
 
 
 class Bench:
-    """A driver and its servos on a line that takes no time. `loses` decides which replies are lost."""
+    """A driver and its servos on a line that takes no time but the silences after requests. `loses` decides which replies are
+    lost."""
 
     def __init__(self, servos: dict[str, dict[str, Any]] | None = None, *, model: KstModel | None = None, **keys: Any) -> None:
         self.options = bus_options(servos, **keys)
@@ -54,12 +55,15 @@ class Bench:
         self.sent: list[Request[Any]] = []
         """The requests sent, including repetitions."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
+        self.altered: list[int] = []
+        """Positions (steps) that the next reads bring instead of the right ones."""
 
     def exchange(self, request: Request[Any]) -> Any:
         """As the engine does it: three tries for what may be repeated."""
         for _ in range(TRIES if request.idempotent else 1):
             self.sent.append(request)
             replies = self._replies(request)
+            self.now += request.quiet_after
             if not request.replies:
                 return request.parse(())
             if replies:
@@ -81,6 +85,8 @@ class Bench:
     def _replies(self, request: Request[Any]) -> list[Frame]:
         """Answers that are whole and belong to the question; those that come at once collide."""
         packet = frame_of(request.frame)
+        if packet.code == Command.READ_POSITION and self.altered:
+            return [frame_of(encode(packet.address, 0x40 + packet.code, encode_position(self.altered.pop(0))))]
         sent = [
             reply.data for device in self.devices if device.baudrate == self.baudrate for reply in device.handle(packet, self.now)
         ]
@@ -103,5 +109,5 @@ def ask_device(device: KstDevice, command: int, data: bytes = b"", *, to: int | 
     return frame_of(replies[0].data) if replies else None
 
 
-def goal(servo: str, value: float, **fields: Any) -> ServoGoal:
-    return ServoGoal(servo, Goal("position", value, **fields), start=0.0)
+def goal(servo: str, value: float, *, lead: float | None = None, **fields: Any) -> ServoGoal:
+    return ServoGoal(servo, Goal("position", value, **fields), start=0.0, lead=lead)

@@ -43,7 +43,8 @@ async def running(
 ) -> AsyncIterator[tuple[BusService, list[KstDevice], list[str]]]:
     """Return the service of a bus of two servos, its devices, and the names of its events."""
     loop = asyncio.get_running_loop()
-    options = bus_options({"pan": {"id": 1}, "tilt": {"id": 2}}, poll={"feedback": 50, "health": 5}, **keys)
+    keys = {"poll": {"feedback": 50, "health": 5}, **keys}
+    options = bus_options({"pan": {"id": 1}, "tilt": {"id": 2}}, **keys)
     models = DEFINITION.models(options, Path())
     events: list[str] = []
     servos = [device for device in DEFINITION.devices(options, models) if isinstance(device, KstDevice)]

@@ -40,30 +40,29 @@ class KstDevice:
         version: int = VERSION,
         immediate: bool = False,
     ) -> None:
-        self.model = model
-        self.node = servo_id
-        self.baudrate = baudrate
-        self.version = version
+        self.model, self.version = model, version
+        self.node, self.baudrate = servo_id, baudrate
         self.immediate = immediate
         """A new id or rate takes effect at once."""
-        self.firmware = model.firmware.encode().ljust(4, b"\0")
-        self.status_bytes = bytes(2)
+        self.firmware, self.status_bytes = model.firmware.encode().ljust(4, b"\0"), bytes(2)
         self.position = self.goal = float(position)
-        """Steps."""
         self.speed = model.max_steps_per_second
         self.delay = DELAY
         self.extra_delay = 0.0
         """Seconds by which its replies are too late."""
-        self.dead = False
-        """It neither receives nor replies."""
+        self.dead = self.mute = False
+        """Dead: it neither receives nor replies. Mute: it obeys, and does not reply."""
+        self.ignores_goals = False
+        """It confirms a position, and keeps its goal."""
+        self.room = (-math.inf, math.inf)
+        """The steps between which nothing blocks it."""
         self.refuses: dict[int, int] = {}
         """Command -> abort code with which it refuses."""
         self.answers: dict[int, bytes] = {}
         """Command -> data that it replies instead of the right data."""
         self.sdo_order = "be"
-        self.answers_save = False
-        self.reads_goal = False
-        """Read position returns the goal instead of the present position."""
+        self.answers_save = self.reads_goal = False
+        """It replies to save; and to read position with its goal instead of where it is."""
         self._rates = dict(baud_table or BAUD_TABLE)
         self._new = self._stored = (servo_id, baudrate)
         """Id and rate that were set, and those that were saved."""
@@ -80,7 +79,7 @@ class KstDevice:
         self.advance(now)
         address = self.node
         answer = self.refuses.get(packet.code) or handler(self, packet.data)
-        if answer is None or broadcast:
+        if answer is None or broadcast or self.mute:
             return ()
         if isinstance(answer, bytes):
             answer = self.answers.get(packet.code, answer)
@@ -93,6 +92,7 @@ class KstDevice:
             left = self.goal - self.position
             step = self.speed * elapsed
             self.position = self.goal if abs(left) <= step else self.position + math.copysign(step, left)
+            self.position = min(max(self.position, self.room[0]), self.room[1])
 
     def reboot(self, now: float) -> None:
         """Switch off and on: what was not saved is lost, and the goal is the default position."""
@@ -129,7 +129,8 @@ class KstDevice:
         steps = codec.decode_position(data)
         if not self.model.range[0] <= steps <= self.model.range[1]:
             return OUT_OF_RANGE
-        self.goal = float(steps)
+        if not self.ignores_goals:
+            self.goal = float(steps)
         return data[:2]
 
     def read_position(self, data: bytes) -> Answer:
