@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from servobus.cli.ending import INTERRUPTED, Ending
 from servobus.cli.output import accept_any_encoding, echo
 from servobus.errors import ServobusError
 
@@ -41,7 +42,6 @@ COMMANDS = {
     "install-service": ("install", "Print or write the files of a system service."),
 }
 """Command -> the module beside this one that has it, and the first sentence of its docstring (a test keeps the two equal)."""
-INTERRUPTED = 130
 
 
 class Commands(click.Group):
@@ -99,19 +99,20 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def status_of(arguments: list[str] | None = None) -> int:
-    """Run a command and return its exit status. An error becomes one message on standard error."""
+    """Run a command and return its exit status. An error becomes one message on standard error, and with --json one document."""
     accept_any_encoding()
+    ending = Ending(as_json="--json" in (sys.argv[1:] if arguments is None else arguments))
     try:
-        result: Any = cli.main(arguments, prog_name="servobus", standalone_mode=False)
+        result: Any = cli.main(arguments, prog_name="servobus", standalone_mode=False, obj=ending)
     except click.ClickException as error:
         error.show()
+        ending.failed(error, error.format_message())
         return error.exit_code
-    except ServobusError as error:
+    except (ServobusError, OSError) as error:
         echo(f"servobus: {error}", err=True)
-        return error.exit_status
-    except OSError as error:
-        echo(f"servobus: {error}", err=True)
-        return ServobusError.exit_status
-    except (KeyboardInterrupt, click.Abort):
-        return INTERRUPTED
+        ending.failed(error, str(error))
+        return error.exit_status if isinstance(error, ServobusError) else ServobusError.exit_status
+    except (KeyboardInterrupt, SystemExit, click.Abort) as error:
+        ending.failed(error)
+        return error.code if isinstance(error, SystemExit) and isinstance(error.code, int) else INTERRUPTED
     return result if isinstance(result, int) else 0

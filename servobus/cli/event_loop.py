@@ -7,10 +7,12 @@ import os
 import signal
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
+from types import FrameType
 from typing import Any, TypeVar
 
+from servobus.cli.ending import INTERRUPTED, TERMINATED, of_command
+
 R = TypeVar("R")
-TERMINATED = 128 + signal.SIGTERM
 SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
@@ -19,8 +21,9 @@ def run(
 ) -> R:
     """Run a coroutine in an event loop of its own.
 
-    Ctrl-C and each of `signals` cancel it, so that exit policies are applied. A second one of `signals` ends the process at once.
-    The exit status after one of `signals` is `terminated`; after Ctrl-C it is 130.
+    Ctrl-C and each of `signals` cancel it, so that exit policies are applied; what is done then is said at once. A second one
+    says what is left energised, and ends the process at once, with 130 after Ctrl-C and 143 otherwise. The exit status after one
+    of `signals` is `terminated`; after Ctrl-C it is 130.
     """
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_until_signalled(main, terminated, signals))
@@ -36,24 +39,31 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
 
 
 async def _until_signalled(main: Callable[[], Coroutine[Any, Any, R]], status: int, signals: Sequence[signal.Signals]) -> R:
-    task, loop = asyncio.current_task(), asyncio.get_running_loop()
+    task, loop, ending = asyncio.current_task(), asyncio.get_running_loop(), of_command()
     assert task is not None
     received: list[int] = []
 
-    def terminate() -> None:
-        if received:
-            os._exit(status)
-        received.append(status)
+    def interrupt() -> None:
         task.cancel()
+        ending.interrupted()
 
-    for number in signals:
-        loop.add_signal_handler(number, terminate)
+    def handle(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        if len(received) == 1:
+            loop.call_soon_threadsafe(interrupt)
+            return
+        try:  # the loop may be blocked, so this is done in the handler
+            ending.abandoned()
+        finally:
+            os._exit(INTERRUPTED if number == signal.SIGINT else TERMINATED)
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, *signals)}
     try:
         return await main()
     except asyncio.CancelledError:
-        if received:
-            raise SystemExit(status) from None
-        raise
+        if not received:
+            raise
+        raise (KeyboardInterrupt() if received[0] == signal.SIGINT else SystemExit(status)) from None
     finally:
-        for number in signals:
-            loop.remove_signal_handler(number)
+        for number, handler in before.items():
+            signal.signal(number, handler)

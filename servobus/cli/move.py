@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+import servobus
 from servobus.cli.options import Number, Options, RigContext, on_rig, parse_pairs, servo_options
 from servobus.cli.output import echo, emit, report
 from servobus.errors import LimitError, NotSupported
@@ -22,6 +23,10 @@ THEN = {
     "park": "parks, then goes limp (on_exit)",
 }
 """What happens to an enabled servo when the command ends, as a table shows it."""
+
+Data = dict[str, Any]
+Rows = list[tuple[object, ...]]
+"""The result of a command, for machines and for people. It is printed when the servos are left: until then it may still fail."""
 
 
 @click.command()
@@ -57,18 +62,26 @@ def move(
 
         check_goals(config, _by_full_name(positions, lambda name: full_name(config.names, name)), speed, duration)
 
-    async def action(context: RigContext) -> None:
+    async def action(context: RigContext) -> tuple[Data, Rows]:
         rig = context.rig
         goals = _by_full_name(positions, rig.full_name)
         if not context.has_daemon:
-            await rig.enable(*goals)
+            await _enable(rig, goals, speed, duration)
         await rig.move(goals, together=together, confirm=confirm, speed=speed, duration=duration)
         states = await rig.settle(*goals, timeout=timeout)
         data = {name: {"position": state.position, "then": context.then(name)} for name, state in states.items()}
-        rows = [(name, state.position, THEN[context.then(name)]) for name, state in states.items()]
-        report(options.as_json, data, ("servo", "position", "then"), rows)
+        return data, [(name, state.position, THEN[context.then(name)]) for name, state in states.items()]
 
-    on_rig(options, action, list(positions), before=check)
+    data, rows = on_rig(options, action, list(positions), before=check, energises=True)
+    report(options.as_json, data, ("servo", "position", "then"), rows)
+
+
+async def _enable(rig: servobus.Rig, goals: Mapping[str, float], speed: float | None, duration: float | None) -> None:
+    """Enable servos once each of them has told that it can take its goal."""
+    from servobus.cli.checks import check_servos
+
+    await check_servos(rig, goals, speed, duration)
+    await rig.enable(*goals)
 
 
 def _position(target: str, text: str) -> float:
@@ -100,14 +113,14 @@ def enable(options: Options, names: tuple[str, ...]) -> None:
     Example: servobus enable elbow
     """
 
-    async def action(context: RigContext) -> None:
+    async def action(context: RigContext) -> tuple[Data, Rows]:
         await context.rig.enable(*names)
         enabled = context.rig.full_names(names)
         data = {name: {"enabled": True, "then": context.then(name)} for name in enabled}
-        rows = [(name, "enabled", THEN[context.then(name)]) for name in enabled]
-        report(options.as_json, data, ("servo", "state", "then"), rows)
+        return data, [(name, "enabled", THEN[context.then(name)]) for name in enabled]
 
-    on_rig(options, action, names)
+    data, rows = on_rig(options, action, names, energises=True)
+    report(options.as_json, data, ("servo", "state", "then"), rows)
 
 
 @click.command()
@@ -125,7 +138,7 @@ def disable(options: Options, names: tuple[str, ...]) -> None:
         data = {name: {"enabled": False} for name in disabled}
         report(options.as_json, data, ("servo", "state"), [(name, "limp") for name in disabled])
 
-    on_rig(options, action, names)
+    on_rig(options, action, names, energises=True)
 
 
 @click.command()

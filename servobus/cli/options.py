@@ -129,6 +129,7 @@ def on_rig(
     only: Collection[str] = (),
     degraded: bool = False,
     before: Callable[[Any], object] | None = None,
+    energises: bool = False,
 ) -> R:
     """Run the action of a command on a rig, in an event loop; the arguments are those of `rig_context.open_context`."""
     from servobus.cli.event_loop import run
@@ -136,7 +137,7 @@ def on_rig(
     from servobus.cli.rig_context import open_context
 
     async def main() -> R:
-        async with open_context(options, names, only=only, degraded=degraded, before=before) as context:
+        async with open_context(options, names, only=only, degraded=degraded, before=before, energises=energises) as context:
             return await action(context)
 
     set_up_logs()

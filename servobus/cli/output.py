@@ -13,6 +13,8 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
+import click
+
 from servobus.values import State
 
 ENCODING_ERRORS = "servobus.replace"
@@ -43,7 +45,10 @@ def echo(text: str, *, err: bool = False, end: str = "\n") -> None:
 
 
 def emit(data: Any) -> None:
-    """Print one JSON document, for machines."""
+    """Print one JSON document, for machines, and note for the end of the command that it has one."""
+    context = click.get_current_context(silent=True)
+    if context is not None and context.obj is not None:
+        context.obj.emitted = True
     echo(json.dumps(data, default=_plain, allow_nan=False))
 
 

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from servobus.cli.ending import of_command
 from servobus.cli.frames import Tracer
 from servobus.cli.logs import SafeStream
 from servobus.cli.options import BusFacts, Options, RigContext
@@ -50,13 +51,19 @@ async def open_own(
     if before is not None:
         before(config)
     buses = dict.fromkeys([*only, *(config.names[name][0] for name in full)])
+    ending = of_command()
     try:
         with _traced(config, options) as trace:
             async with open_rig(config, buses=list(buses), degraded=degraded, trace=trace) as rig:
+                if not options.dry_run:
+                    ending.energised = rig.to_leave
                 on_exit = {name: config.buses[bus].servos[servo].on_exit for name, (bus, servo) in config.names.items()}
                 yield RigContext(rig, lambda: _buses_of(config), on_exit)
     except PortBusy as error:
         raise await _with_hint(error, options.socket or find_socket()) from None
+    finally:
+        if ending.energised is not None:
+            ending.left = dict(rig.left)
     if doubtful := [f"{name} ({report.action}: {report.detail})" for name, report in rig.left.items() if not report.confirmed]:
         raise DeviceError(f"not confirmed how it was left: {', '.join(doubtful)}; check the servo before you touch it")
 

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import Any
 
+from servobus.cli.ending import of_command
 from servobus.cli.options import BusFacts, Options, RigContext
 from servobus.errors import LinkDown, NotSupported
 from servobus.remote.address import NoDaemon
 from servobus.remote.rig import RemoteRig, connect
 from servobus.rpc.socket_path import VARIABLE, find_socket
+from servobus.values import Health, State, StopReport
 
+KEPT = "the daemon keeps it; `servobus disable` switches its torque off"
 TRACE_REFUSED = "a daemon has this bus, and --trace shows only the frames of this process: stop the daemon, or omit --trace"
 
 
@@ -28,6 +31,7 @@ async def open_context(
     only: Collection[str] = (),
     degraded: bool = False,
     before: Callable[[Any], object] | None = None,
+    energises: bool = False,
 ) -> AsyncIterator[RigContext]:
     """Connect to the running daemon, else open the ports of the config.
 
@@ -37,6 +41,7 @@ async def open_context(
         only: Buses to open in addition; with neither, all are opened.
         degraded: A rig of its own starts without the buses whose ports cannot be opened.
         before: Called with the Config before a port is opened; raises what is to be refused.
+        energises: The command moves or energises these servos: when it fails, it says which of them are energised.
 
     Raises:
         UnknownName: A servo is not in the config; no port was opened.
@@ -45,13 +50,32 @@ async def open_context(
     async with AsyncExitStack() as stack:
         remote = await _connect(stack, options)
         if remote is not None:
-            remote.full_names(names)
-            yield RigContext(remote, lambda: buses_of(remote))
+            full = remote.full_names(names)
+            with _said_when_it_fails(remote, full if energises else []):
+                yield RigContext(remote, lambda: buses_of(remote))
             return
     from servobus.cli.own_rig import open_own
 
     async with open_own(options, names, only, before, degraded=degraded) as context:
         yield context
+
+
+@contextmanager
+def _said_when_it_fails(rig: RemoteRig, names: Collection[str]) -> Iterator[None]:
+    """A command that fails says which of these servos a daemon keeps energised."""
+
+    def energised() -> Mapping[str, State]:
+        states = rig.snapshot()
+        return {name: states[name] for name in names if name in states and (states[name].enabled or states[name].energised)}
+
+    ending = of_command()
+    ending.energised, ending.has_daemon = lambda: dict.fromkeys(energised(), "stays"), True
+    try:
+        yield
+    except BaseException:
+        for name, state in energised().items():
+            ending.left[name] = StopReport("stays", False, state.health is not Health.OFFLINE, KEPT)
+        raise
 
 
 async def _connect(stack: AsyncExitStack, options: Options) -> RemoteRig | None:

@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from servobus.cli.ending import INTERRUPTED
 from servobus.cli.options import Options, RigContext, on_rig
 from servobus.cli.scan import ScanTarget
 from servobus.config.loader import Config, parse_config
@@ -18,7 +19,6 @@ from servobus.errors import UnknownName
 from servobus.protocols.registry import PROTOCOLS
 from servobus.values import ScanHit
 
-INTERRUPTED = 130
 MIN_RATE, MAX_RATE = 300, 10_000_000
 BUS = "line"  # name of the bus of a bare port
 

@@ -27,10 +27,12 @@ def run(config: str, log_every: float) -> None:
 
     Example: servobus run config/arm.yaml
     """
+    from servobus.cli.ending import of_command
     from servobus.cli.event_loop import run as run_loop
     from servobus.cli.logs import set_up_logs
     from servobus.config.loader import load_config
     from servobus.daemon.main import serve_rig
+    from servobus.rig.local import LocalRig
     from servobus.rig.logs import EventLogger
     from servobus.rpc.socket_path import socket_path
 
@@ -39,10 +41,16 @@ def run(config: str, log_every: float) -> None:
     load_config(config)  # a wrong config is refused before the socket is claimed
     if Path(config).stat().st_mode & stat.S_IWOTH:
         raise ConfigError(f"{config}: every user may write to it, and so decide what this daemon does: run chmod o-w {config}")
+    log, ending = EventLogger("servobus.cli"), of_command()
+    ending.say = lambda text: log.warning("ending", text=text)
+
+    def opened(rig: LocalRig) -> None:
+        ending.energised = rig.to_leave
+
     try:
-        run_loop(lambda: serve_rig(config, socket_path(), log_every), terminated=0, signals=[signal.SIGTERM])
+        run_loop(lambda: serve_rig(config, socket_path(), log_every, opened), terminated=0, signals=[signal.SIGTERM])
     finally:
-        EventLogger("servobus.cli").info("ended")
+        log.info("ended")
 
 
 @click.command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,9 +25,11 @@ CHECKS = 3  # checks of the buses within the time that the system's watchdog all
 log = EventLogger("servobus.daemon")
 
 
-async def serve_rig(config: str, path: Path, log_every: float) -> None:
-    """Run the daemon of a config until it is cancelled. The socket is claimed before a port is opened, so that a second daemon
-    disturbs nothing. Raises ConfigError, PortBusy."""
+async def serve_rig(config: str, path: Path, log_every: float, opened: Callable[[LocalRig], object] = bool) -> None:
+    """Run the daemon of a config until it is cancelled; `opened` gets its rig. Raises ConfigError, PortBusy.
+
+    The socket is claimed before a port is opened, so that a second daemon disturbs nothing.
+    """
     reloads = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)  # first: a SIGHUP before READY is done after it
     notifier, listener = Notifier(), claim(path)
@@ -35,6 +38,7 @@ async def serve_rig(config: str, path: Path, log_every: float) -> None:
         open_door(rig, path, owner=os.geteuid(), listener=listener) as door,
         anyio.create_task_group() as group,
     ):
+        opened(rig)
         log.info("running", config=config, buses=list(rig.buses), doors=door.addresses, pid=os.getpid())
         notifier.ready(f"{len(rig.buses)} buses, {len(rig.names)} servos")
         group.start_soon(_reload, rig, door, notifier, reloads)

@@ -140,6 +140,10 @@ class LocalRig(Rig):
         supervisor.scope.cancel()
         await supervisor.close()
 
+    def to_leave(self) -> dict[str, str]:
+        """The servos whose torque may be on because of us, by full name, and what the end does to each: hold, limp or park."""
+        return {f"{name}/{each.name}": each.options.on_exit for name, bus in self.buses.items() for each in bus.stops.to_leave()}
+
     async def leave(self) -> None:
         """Apply the exit policies, on all buses at once; `left` then says how each servo was left."""
         reloading = () if self._reloading is None else (self._reloading,)
