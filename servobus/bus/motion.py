@@ -106,7 +106,7 @@ class Motion:
         parts = self._parts
         record = parts.records[goal.servo]
         future: asyncio.Future[Outcome] = self._loop.create_future()
-        expires = now + (goal.goal.start_within or record.options.ttl or self._default_start_within(record))
+        expires = now + self.start_within(goal.servo, goal.goal)
         done = partial(self._ended, record, goal.goal, future)
         ticket = Ticket(goal, record.node.id, expires, done, batch, confirm, future.cancelled, now)
         parts.stats.counts[GOALS] += 1
@@ -116,7 +116,12 @@ class Motion:
         parts.scheduler.put_goal(ticket, now, speed=speed, start=start)
         return future
 
-    def _default_start_within(self, record: ServoRecord) -> float:
+    def start_within(self, servo: str, goal: Goal) -> float:
+        """Return the seconds within which the first byte of a goal must leave."""
+        record = self._parts.records[servo]
+        within = goal.start_within or record.options.ttl
+        if within:
+            return within
         two_turns: float = 2 * (record.node.reply_allowance_s + self._parts.line.traits.latency)
         return two_turns if two_turns > MIN_START_WITHIN else MIN_START_WITHIN
 

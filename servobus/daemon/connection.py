@@ -1,15 +1,16 @@
 """One client of the daemon: an asyncio protocol.
 
-Received lines are searched for a call of `stop` or `renew`, which is done before anything else. The other lines wait for their
-share of the loop, in turn with those of all other clients. A client that sends above its rate is read more slowly. A client that
-does not read gets no more notices, and is disconnected when that lasts.
+Received lines are searched for calls of `stop`, `renew` and `cancel`, which are done before anything else. The other lines wait
+for their share of the loop, in turn with those of all other clients. A client that sends above its rate is read more slowly. A
+client that does not read gets no more notices, and is disconnected when that lasts.
 """
 
 from __future__ import annotations
 
 import asyncio
+import select
 import socket
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Coroutine
 from types import CoroutineType
 from typing import Any, Protocol, cast
@@ -20,7 +21,9 @@ from servobus.daemon.jsonrpc import URGENT, Call, Framer, Refused, call_of, enco
 from servobus.daemon.methods import HANDLERS, Services, require_role
 from servobus.errors import ServobusError
 from servobus.rig.logs import EventLogger
+from servobus.rpc.clock import CallerClock
 from servobus.rpc.methods import Hello
+from servobus.timers import clock_of
 
 MAX_WAITING = 256 * 1024
 """Bytes of one client that may wait; above it the client is not read. More than our own client lets wait, so that its `stop` is
@@ -30,6 +33,8 @@ MAX_UNREAD = 256 * 1024  # bytes that a client may be behind with reading
 MAX_BLOCKED = 10.0  # seconds after which a client that reads nothing is disconnected
 OVERHEAD = 64  # bytes that a waiting line takes besides its text
 MAX_LABEL = 64  # letters of a client's name
+URGENT_CALLS = {"stop": 1, "renew": 1, "cancel": 64}
+"""How many calls of each urgent method go ahead of what came with them; a flood of them waits like any other call."""
 
 log = EventLogger("servobus.daemon")
 
@@ -69,7 +74,9 @@ class ClientConnection(asyncio.Protocol):
         self._framer = Framer()
         self._lines: deque[bytes] = deque()
         self._waiting = 0  # bytes that they take
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], Any] = {}  # each with the id of its call; None: it has none
+        self._withdrawn: set[Any] = set()  # ids of calls that were cancelled while they waited
+        self._clock = CallerClock()
         self._scheduled = False  # a next line will be handled without further ado
         self._paused = False  # the socket is not read
         self._closed = False
@@ -87,6 +94,26 @@ class ClientConnection(asyncio.Protocol):
         if self._tcp and self.role is Role.NOBODY:
             self.role = self.door.admit(self, params.token)
         self._name = printable(params.client)
+        self._clock.greet(params.machine)
+        self.age(params.asked)
+
+    def age(self, asked: float | None) -> float:
+        """Return the seconds since a call was made at `asked` of the client's clock."""
+        return self._clock.age(asked, clock_of(self.door.loop)())
+
+    def has_left(self) -> bool:
+        """Return whether the client has closed its connection, which is noticed only when all it sent is read."""
+        poll = select.poll()
+        poll.register(self._transport.get_extra_info("socket").fileno(), 0)
+        return any(event & (select.POLLHUP | select.POLLERR) for _, event in poll.poll(0))
+
+    def cancel(self, call: Any) -> None:
+        """Withdraw a call of this connection: one that waits does not begin, one that is under way is cancelled."""
+        tasks = [task for task, number in self._tasks.items() if number == call]
+        for task in tasks:
+            task.cancel()
+        if not tasks and self._lines:
+            self._withdrawn.add(call)
 
     # The socket
 
@@ -105,7 +132,7 @@ class ClientConnection(asyncio.Protocol):
         self._lines.clear()
         self._stop_timer()
         self.door.leave(self)
-        for task in self._tasks:
+        for task in tuple(self._tasks):
             task.cancel()
 
     def pause_writing(self) -> None:
@@ -138,14 +165,18 @@ class ClientConnection(asyncio.Protocol):
             self.write(refusal.reply() + b"\n")
             self._transport.close()
             return
-        allowed = set(URGENT)  # one of each in what came together goes ahead; a flood of them waits like any other call
+        ahead = []
+        allowed = Counter(URGENT_CALLS)
         for line in lines:
-            if methods := urgent(line) & allowed:
-                allowed -= methods
-                self._do(line)
+            methods = urgent(line)
+            if methods and all(allowed[method] for method in methods):
+                allowed.subtract(methods)
+                ahead.append(line)
             elif line.strip():
                 self._lines.append(line)
                 self._waiting += len(line) + OVERHEAD
+        for line in ahead:
+            self._do(line)
         if self._waiting > MAX_WAITING and not self._paused:
             self._paused = True
             self._transport.pause_reading()
@@ -166,6 +197,7 @@ class ClientConnection(asyncio.Protocol):
         """Handle one line. Returns whether another one may be handled at once."""
         if self._closed or not self._lines:
             self._scheduled = False
+            self._withdrawn.clear()
             return False
         line = self._lines.popleft()
         self._waiting -= len(line) + OVERHEAD
@@ -197,15 +229,18 @@ class ClientConnection(asyncio.Protocol):
             except Refused as refusal:
                 calls.append(refusal)
         if line.lstrip().startswith(b"["):
-            self._spawn(self._batch(calls))
+            self._spawn(self._batch(calls), None)
             return
         (call,) = calls
         if isinstance(call, Refused):
             self.write(call.reply() + b"\n")
             return
+        if call.id in self._withdrawn:
+            self._withdrawn.discard(call.id)
+            return  # nobody waits for its reply
         result = self._begin(call)
         if isinstance(result, CoroutineType):
-            self._spawn(self._finish(call, result))
+            self._spawn(self._finish(call, result), call.id if call.wants_reply else None)
         elif call.wants_reply:
             self.write(self._reply(call, result) + b"\n")
 
@@ -252,13 +287,13 @@ class ClientConnection(asyncio.Protocol):
         except Exception as error:  # noqa: BLE001 - whatever it is, it becomes the reply
             return error
 
-    def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, coroutine: Coroutine[Any, Any, None], call: Any) -> None:
         task = self.door.loop.create_task(coroutine)
-        self._tasks.add(task)
+        self._tasks[task] = call
         task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
+        self._tasks.pop(task, None)
         self._handle_lines()
         self._leave_if_done()
 

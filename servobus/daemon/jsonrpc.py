@@ -20,7 +20,7 @@ STRING = re.compile(rb'"(?:[^"\\]|\\.)*"')
 STEP = {ord("{"): 1, ord("["): 1, ord("}"): -1, ord("]"): -1}
 encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder().decode
-URGENT = frozenset({"stop", "renew"})  # methods that do not wait for earlier calls
+URGENT = frozenset({"stop", "renew", "cancel"})  # methods that do not wait for earlier calls
 _urgent = re.compile(rb'"(?:%b)"' % b"|".join(name.encode() for name in sorted(URGENT)))
 NO_ID = object()  # the id of a notification, which gets no reply
 

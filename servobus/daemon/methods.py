@@ -6,21 +6,23 @@ A handler returns the result, or a coroutine to await for it: what needs no turn
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from servobus import __version__
 from servobus.daemon.lease_watch import LeaseWatch
 from servobus.daemon.subscriptions import Subscriber, Subscriptions
-from servobus.errors import AccessDenied, LimitError, NotSupported
+from servobus.errors import AccessDenied, LimitError, LinkDown, NotSupported
+from servobus.rig.interface import Rig, Servo
 from servobus.rig.local import LocalRig
 from servobus.rig.verbs import VERBS, LeaseRule, Verb, caller, servos
 from servobus.rpc.methods import METHODS, PROTOCOL, Greeting, Hello, LeaseGrant, Names, Nothing, RigHealth, needed_role
-from servobus.values import Health, Role, ScanHit
+from servobus.values import Goal, Health, Outcome, Role, ScanHit
 
 MAX_SCAN = 65_536  # ids and rates of one scan
 MAX_SETTLE = 3600.0  # seconds
+PROMPT = 0.001  # seconds on its way to the daemon by which a motion is not late
 
 
 class Client(Subscriber, Protocol):
@@ -33,7 +35,16 @@ class Client(Subscriber, Protocol):
         """Its name for others."""
 
     def greet(self, params: Hello) -> None:
-        """Take its name and token. Raises AccessDenied."""
+        """Take its name, token and clock. Raises AccessDenied."""
+
+    def age(self, asked: float | None) -> float:
+        """Return the seconds since it made a call, at `asked` of its clock."""
+
+    def has_left(self) -> bool:
+        """Return whether it has closed its connection."""
+
+    def cancel(self, call: Any) -> None:
+        """Withdraw a call that it made."""
 
     def notify(self, method: str, params: Any) -> None: ...
 
@@ -47,6 +58,26 @@ class Services:
     subscriptions: Subscriptions
 
 
+class LateRig:
+    """The rig for a motion that was on its way to the daemon for a while: its goals have that much less time to start."""
+
+    move = Rig.move
+
+    def __init__(self, rig: LocalRig, age: float) -> None:
+        self._rig = rig
+        self._age = age
+
+    def __getitem__(self, name: str) -> Servo:
+        return Servo(cast("Rig", self), self._rig.full_name(name))
+
+    async def send(self, name: str, goal: Goal, *, confirm: bool = False) -> Outcome:
+        return await self._rig.send(name, self._rig.shortened(name, goal, self._age), confirm=confirm)
+
+    async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
+        shorter = {name: self._rig.shortened(name, goal, self._age) for name, goal in goals.items()}
+        return await self._rig.send_all(shorter, together=together, confirm=confirm)
+
+
 Handler = Callable[[Services, Client, Any], Any]
 
 
@@ -55,17 +86,28 @@ def _verb_handler(verb: Verb) -> Handler:
     call = caller(verb)
 
     def free(services: Services, client: Client, params: Any) -> Any:
+        if verb.name != "disable":
+            _refuse_absent(client)
         services.leases.check(client, servos(verb, services.rig, params))
         return call(services.rig, params)
 
     def taken(services: Services, client: Client, params: Any) -> Any:
-        names = servos(verb, services.rig, params)
-        if not services.rig.stopped:  # what the e-stop refuses takes no lease
+        rig, age = services.rig, client.age(params.asked)
+        names = servos(verb, rig, params)
+        if age > PROMPT or params.asked is None:
+            _refuse_absent(client)
+        if not rig.stopped:  # what the e-stop refuses takes no lease
             services.leases.take(client, client.label, names)
-        return call(services.rig, params)
+        return call(rig if age <= PROMPT else cast("Rig", LateRig(rig, age)), params)
 
     rules: dict[LeaseRule, Handler] = {LeaseRule.FREE: free, LeaseRule.TAKEN: taken}
     return rules.get(verb.lease, lambda services, _, params: call(services.rig, params))
+
+
+def _refuse_absent(client: Client) -> None:
+    """Refuse a call that was read when its caller had closed the connection already. Raises LinkDown."""
+    if client.has_left():
+        raise LinkDown("the caller has left: nothing was sent")
 
 
 # Verbs with something of their own
@@ -160,6 +202,7 @@ HANDLERS: dict[str, Handler] = {
     "config": config,
     "leases": lambda services, _, __: services.leases.holders(),
     "subscribe": lambda services, client, params: services.subscriptions.add(client, params),
+    "cancel": lambda _, client, params: client.cancel(params.call),
     "unsubscribe": lambda services, client, params: services.subscriptions.remove(client, params.subscription),
 }
 

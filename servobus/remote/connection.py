@@ -141,7 +141,10 @@ class DaemonConnection(asyncio.Protocol):
     # Calls
 
     async def call(self, method: str, params: dict[str, Any], *, timeout: float, then: Callable[[Any], Any] | None = None) -> Any:
-        """Call a method and return its result. Raises the error of the reply, LinkDown; ReplyTimeout after `timeout` seconds."""
+        """Call a method and return its result. A caller that is cancelled, or gives up, withdraws its call.
+
+        Raises the error of the reply, LinkDown; ReplyTimeout after `timeout` seconds.
+        """
         if self.down is not None:
             raise LinkDown(f"{self.down.message}; nothing was sent")
         full = len(self._calls) >= MAX_WAITING or self._transport.get_write_buffer_size() > MAX_UNSENT
@@ -154,6 +157,9 @@ class DaemonConnection(asyncio.Protocol):
         self._transport.write(line)
         try:
             return await reply
+        except asyncio.CancelledError:
+            self.notify("cancel", {"call": number})
+            raise
         finally:
             self._forget(number)
 
@@ -186,6 +192,7 @@ class DaemonConnection(asyncio.Protocol):
         if not call.reply.done():
             message = f"the daemon did not answer {call.method} within {call.timeout:g} s: it may have been applied"
             call.reply.set_exception(ReplyTimeout(message))
+            self.notify("cancel", {"call": number})  # what has not begun yet must not begin later
 
     def _forget(self, number: int) -> None:
         call = self._calls.pop(number, None)

@@ -28,7 +28,9 @@ from servobus.remote.session import Opener, Session
 from servobus.rig.events import Event, EventSource, EventStream
 from servobus.rig.interface import Rig
 from servobus.rig.verbs import DEADLINE, VERBS, Verb, arguments
+from servobus.rpc.clock import machine
 from servobus.rpc.methods import MAX_HZ, MIN_HZ, Greeting
+from servobus.timers import clock_of
 from servobus.values import (
     GOAL_NUMBERS,
     EventName,
@@ -77,7 +79,7 @@ async def connect(
     if not MIN_HZ <= refresh_hz <= MAX_HZ:
         raise ValueError(f"connect: refresh_hz {refresh_hz} is outside {MIN_HZ:g} to {MAX_HZ:g}")
     where = address_of(address, tls)
-    rig = RemoteRig.make(str(where), where.open, lambda: {"client": name, "token": token_of(token, token_file)}, refresh_hz)
+    rig = RemoteRig.make(str(where), where.open, partial(_hello, name, token, token_file), refresh_hz)
     try:
         await rig.start()
         yield rig
@@ -85,6 +87,12 @@ async def connect(
         await rig.leave(lost=True)
         raise
     await rig.leave(lost=False)
+
+
+def _hello(name: str, token: str | None, token_file: str | Path | None) -> dict[str, Any]:
+    """The parameters of a greeting now."""
+    clock = clock_of(asyncio.get_running_loop())
+    return {"client": name, "token": token_of(token, token_file), "machine": machine(), "asked": clock()}
 
 
 def _forward(verb: Verb) -> Callable[..., Coroutine[Any, Any, Any]]:
@@ -127,7 +135,7 @@ class RemoteRig(Rig):
         self._session = Session(address, opener, hello, self._greeted, self._fill_cache, self._changed, self._progressed)
         self._leases = ClientLeases(self._session)
         self._refresh_hz = refresh_hz
-        self._clock = asyncio.get_running_loop().time
+        self._clock = clock_of(asyncio.get_running_loop())
         self._renaming: asyncio.Task[None] | None = None
         self._scans: dict[str, Callable[[int, int, ScanHit | None], None]] = {}
         self._watches: set[LatestSnapshot] = set()
@@ -269,13 +277,15 @@ class RemoteRig(Rig):
 
     async def send_all(self, goals: Mapping[str, Goal], *, together: bool = False, confirm: bool = False) -> dict[str, Outcome]:
         checked: dict[str, Goal] = {}
+        asked = self._clock()
         for name, goal in goals.items():
             if (full := self.full_name(name)) in checked:
                 raise InvalidRequest(f"{full} is named twice: give it one goal; nothing was sent")
             checked[full] = self._checked(full, goal)
         if not checked:
             return {}
-        params = {"goals": {name: asdict(goal) for name, goal in checked.items()}, "together": together, "confirm": confirm}
+        plain = {name: asdict(goal) for name, goal in checked.items()}
+        params = {"goals": plain, "together": together, "confirm": confirm, "asked": asked}
         return cast("dict[str, Outcome]", await self._leases.move("send_all", checked, params, partial(_exactly, checked)))
 
     def _checked(self, name: str, goal: Goal) -> Goal:
@@ -337,7 +347,7 @@ class RemoteRig(Rig):
         ids: Iterable[int] = (),
         progress: Callable[[int, int, ScanHit | None], None] | None = None,
     ) -> list[ScanHit]:
-        """As `Rig.scan` (`bus`, `baudrates`, `ids`, `progress`). When the caller is cancelled, the daemon goes on with it."""
+        """As `Rig.scan` (`bus`, `baudrates`, `ids`, `progress`)."""
         params = {"bus": bus, "baudrates": list(baudrates), "ids": list(ids), "progress": True}
         call = asyncio.ensure_future(self._session.call("scan", params))
         failures: list[Exception] = []

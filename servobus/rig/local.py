@@ -6,7 +6,7 @@ import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from anyio.abc import TaskGroup
 from servobus.bus.scan import scan
 from servobus.bus.service import BusService
 from servobus.config.loader import Config, load_config
-from servobus.errors import Busy, InvalidRequest, NotSupported, UnknownName
+from servobus.errors import Busy, GoalExpired, InvalidRequest, NotSupported, UnknownName
 from servobus.protocols.registry import PROTOCOLS
 from servobus.rig.events import Event, EventSource, EventStream
 from servobus.rig.interface import Rig
@@ -178,6 +178,15 @@ class LocalRig(Rig):
             for servo, future in self.buses[bus].motion.put(part, together=together, confirm=confirm).items()
         }
         return await outcomes(futures)
+
+    def shortened(self, name: str, goal: Goal, age: float) -> Goal:
+        """The `goal` for the servo `name` of a call made `age` seconds ago: it has that much less time. Raises GoalExpired."""
+        bus, servo = self.bus_of(name)
+        within = bus.motion.start_within(servo, goal)
+        if age < within:
+            return replace(goal, start_within=within - age)
+        late = f"the call was on its way for {age:.1f} s, and its goal was to start within {within:g} s"
+        raise GoalExpired(f"{late}: nothing was sent; retry", bus=bus.name, servo=servo)
 
     async def send(self, name: str, goal: Goal, *, confirm: bool = False) -> Outcome:
         bus, servo = self.bus_of(name)

@@ -30,11 +30,22 @@ class Nothing(Params):
 
 
 class Hello(Params):
-    """The first call on TCP, with the token. On a Unix socket it is optional, and gives the client a name."""
+    """The first call on TCP, with the token. On a Unix socket it is optional, and gives the client a name.
+
+    `machine` and `asked` tell whose clock the client has (`rpc/clock.py`).
+    """
 
     client: str = ""
     token: str | None = None
     protocol: int = PROTOCOL
+    machine: str = ""
+    asked: float | None = None
+
+
+class Cancel(Params):
+    """The id of an earlier call of this connection that its caller does not want any more."""
+
+    call: int | str | float
 
 
 class Greeting(msgspec.Struct, frozen=True):
@@ -105,12 +116,14 @@ class Method:
 
 
 def method_of(verb: Verb) -> Method:
-    """A verb as a method: a message with the fields of its signature."""
+    """A verb as a method: a message with the fields of its signature; for a motion also `asked`, when its caller called."""
     title = "".join(part.capitalize() for part in verb.name.split("_"))
     doc = {"__doc__": verb.function.__doc__}
-    made = msgspec.defstruct(title, fields(verb), bases=(Params,), namespace=doc, forbid_unknown_fields=True, module=__name__)
+    motion = verb.lease is LeaseRule.TAKEN
+    columns = [*fields(verb), ("asked", float | None, None)] if motion else fields(verb)
+    made = msgspec.defstruct(title, columns, bases=(Params,), namespace=doc, forbid_unknown_fields=True, module=__name__)
     params = cast("type[Params]", made)
-    return Method(params, signature(verb).return_annotation, verb.role, verb.lease is LeaseRule.TAKEN, verb.deadline)
+    return Method(params, signature(verb).return_annotation, verb.role, motion, verb.deadline)
 
 
 METHODS: dict[str, Method] = {
@@ -124,6 +137,7 @@ METHODS: dict[str, Method] = {
     "leases": Method(Nothing, dict[str, str], Role.OBSERVER),
     "subscribe": Method(Subscribe, int, Role.OBSERVER),
     "unsubscribe": Method(Unsubscribe, None, Role.OBSERVER),
+    "cancel": Method(Cancel, None, Role.OBSERVER),
     **{verb.name: method_of(verb) for verb in VERBS.values() if verb.door},
     "acquire": Method(Names, LeaseGrant, Role.OPERATOR),
     "renew": Method(Nothing, LeaseGrant, Role.OPERATOR),

@@ -25,7 +25,7 @@ from tests.virtual_time import virtual
 TOKEN = "correct-horse-battery-staple-0123456789"
 OBSERVERS = {
     *("stop", "names", "read", "snapshot", "stopped", "settle", "read_register", "ping", "identify", "health", "stats"),
-    *("config", "leases", "subscribe", "unsubscribe"),
+    *("config", "leases", "subscribe", "unsubscribe", "cancel"),
 }
 OPERATORS = {
     *("move", "move_to", "spin", "send_all", "enable", "disable", "clear", "acquire", "renew", "release", "write_register"),
@@ -37,6 +37,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "read_register": {"name": "s1", "register": "id"},
     "subscribe": {"topic": "events"},
     "unsubscribe": {"subscription": 99},
+    "cancel": {"call": 99},
     "move": {"positions": {"s1": 1}},
     "move_to": {"name": "s1", "position": 1},
     "spin": {"name": "s1", "velocity": 1},

@@ -76,7 +76,8 @@ async def test_tokens(tmp_path: Path) -> None:
     async with puppet_daemon(path) as daemon:
         token.write_text("  abc\n")
         async with connect(path, token_file=token, name="arm app"):
-            assert daemon.calls("hello") == [{"client": "arm app", "token": "abc", "protocol": 1}]
+            (hello,) = daemon.calls("hello")
+            assert (hello["client"], hello["token"], hello["protocol"]) == ("arm app", "abc", 1)
         assert isinstance(await refused(path, token="a", token_file=token), ConfigError)
         assert "empty" in str(await refused(path, token_file=tmp_path / "empty"))
         daemon.answers["hello"] = failed("AccessDenied", "the token is not right")
