@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Callable
 
-from tests.campaigns import crowd, daemon, dead_servo, faults, slow_hand
+from tests.campaigns import crowd, daemon, days, dead_servo, faults, slow_hand
 from tests.campaigns.oracle import ORACLES
 
 
@@ -59,6 +59,12 @@ def soak_daemon(_: int) -> bool:
     return result.kept()
 
 
+def soak_days(hours: float) -> bool:
+    result = days.days(hours)
+    result.report()
+    return result.kept()
+
+
 CAMPAIGNS: dict[str, Callable[[int], bool]] = {
     "faults": soak_faults,
     "cancel": soak_cancel,
@@ -67,18 +73,21 @@ CAMPAIGNS: dict[str, Callable[[int], bool]] = {
     "kill": soak_kill,
     "daemon": soak_daemon,
 }
+NAMES = (*CAMPAIGNS, "days")
 
 
 def main() -> int:
     """Status 1 when a figure misses what it has to reach."""
     parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__)
-    parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=f"{', '.join(CAMPAIGNS)}; all if none is named")
+    parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=f"{', '.join(NAMES)}; all if none is named")
     parser.add_argument("--count", type=int, default=1_000_000, help="reads of the faults campaign, ten times the cancels")
+    parser.add_argument("--hours", type=float, default=1.5, help="virtual hours of the days campaign")
     arguments = parser.parse_args()
-    if unknown := set(arguments.campaigns) - set(CAMPAIGNS):
-        parser.error(f"no campaign {', '.join(sorted(unknown))}: there are {', '.join(CAMPAIGNS)}")
+    if unknown := set(arguments.campaigns) - set(NAMES):
+        parser.error(f"no campaign {', '.join(sorted(unknown))}: there are {', '.join(NAMES)}")
     logging.getLogger("servobus").setLevel(logging.ERROR)
-    kept = [CAMPAIGNS[name](arguments.count) for name in arguments.campaigns or CAMPAIGNS]
+    campaigns = CAMPAIGNS | {"days": lambda _: soak_days(arguments.hours)}
+    kept = [campaigns[name](arguments.count) for name in arguments.campaigns or campaigns]
     return 0 if all(kept) else 1
 
 

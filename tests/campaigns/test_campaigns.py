@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from tests.campaigns import dead_servo, faults, slow_hand
+from tests.campaigns import days, dead_servo, faults, slow_hand
 from tests.campaigns.faults import KINDS, Result
 from tests.campaigns.oracle import ORACLES
 
@@ -63,3 +63,11 @@ def test_a_hand_slower_than_the_deadline() -> None:
     assert_right(result)
     assert result.reads > 200
     assert result.timeouts > 50
+
+
+def test_half_a_minute_of_the_days() -> None:
+    result = days.days(0.01)
+    assert not any(result.balance().values())
+    assert result.drift < days.MAX_DRIFT
+    assert result.counts["timeouts"] > 50, "the line was as bad as it should be"
+    assert result.outcomes["sent"] > 4000
