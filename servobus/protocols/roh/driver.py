@@ -1,7 +1,7 @@
 """The ROH driver: which requests each verb of hands and fingers takes (ROH Modbus, 3 and 4). Sans-IO. Not tried on hardware yet.
 
 A hand is a node, and its fingers are servos. A hand has no ping, torque or stop command. So a ping reads a register, `enable`
-writes nothing and only lets goals pass, and a stop writes each finger's present position as its target.
+moves nothing and lets goals pass, and a stop writes each finger's present position as its target.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from servobus.errors import DeviceError, UnknownName
+from servobus.errors import DeviceError, ServobusError, UnknownName
 from servobus.protocols import fence
 from servobus.protocols.base import Driver, GoalPlan, LineTraits, Plan, Poll, Request, ask
 from servobus.protocols.modbus.codec import MAX_UNIT, Function, reply_key
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, Fence, PresenceRead, RtuTiming
-from servobus.protocols.roh import goals, stop
+from servobus.protocols.modbus.requests import Fence, PresenceRead, RtuTiming
+from servobus.protocols.roh import enabling, goals, stop
 from servobus.protocols.roh.commissioning import RohCommissioning
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import FIRST, Hand, identity
@@ -25,14 +25,15 @@ from servobus.protocols.roh.options import MAPS, RohBus
 from servobus.protocols.roh.registers import NamedWrite, named_write, read_named
 from servobus.protocols.roh.spans import Limits, Span, read_spans
 from servobus.protocols.spans import parse_span
-from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, Loss, ServoGoal, StopReport, StopTarget, Update
 
 IDENTITY_FENCES = range(1, 10)
 """Fences of so many registers begin at the first one; behind them are registers that can only be written."""
 OTHER_FENCES = 1020
 """Longer fences begin here: the calibration and what follows can be read in every map."""
 MAX_FENCE = 60
-HEALTH = ("status", "current")
+HEALTH = ("status", "current", "speed")
+"""The speed shows a restart."""
 
 
 class RohDriver(Driver):
@@ -68,6 +69,14 @@ class RohDriver(Driver):
     def use_traits(self, traits: LineTraits) -> None:
         self.limits.read, self.limits.write = self.options.limits(traits)
         self._reads.clear()
+
+    def use_options(self, options: RohBus) -> bool:
+        if not self.options.is_live_change(options):
+            return False
+        self.options = options
+        for name, finger in self.fingers.items():
+            finger.use_options(options.servos[name])
+        return True
 
     def explain(self, servo: str, error: DeviceError) -> Plan[DeviceError]:
         """Ask for the reason of a device failure, which the hand keeps in a register (ROH Modbus, 3.4)."""
@@ -116,18 +125,14 @@ class RohDriver(Driver):
         return Fence(self.timing, node, address, count, list, refusable=refusable)
 
     def _is_unchanged(self, hand: Hand, enabled: Collection[str]) -> Plan[bool]:
-        """Return whether the registers of the enabled fingers hold what they held. A device failure means that it initialises."""
-        names = {finger: (finger.target_name, *finger.held.settings) for finger in hand.fingers if finger.name in enabled}
-        if not names:
-            return True
+        """Return whether the registers of the enabled fingers hold what they held."""
+        names = {
+            finger: (finger.target_name, "speed", *finger.held.settings) for finger in hand.fingers if finger.name in enabled
+        }
         try:
-            values = yield from hand.read_values(names)
-        except DeviceError as error:
-            return error.code != DEVICE_FAILURE
-        if all(value.finger.held.matches(value.name, value.raw) for value in values):
-            return True
-        hand.forget()
-        return False
+            return (yield from hand.is_kept(names))
+        except DeviceError:
+            return True  # it answers, and does not report these registers
 
     def inspect(self, node: int) -> Plan[Identity]:
         registers = yield from ask(self._hand_of(node).identity_read())
@@ -139,50 +144,56 @@ class RohDriver(Driver):
         registers = yield from ask(hand.identity_read())
         hand.learn(registers)
         result = identity(registers, [self._models[name] for name in MAPS])
-        return replace(result, notes=(hand.fit.obstacle,) if hand.fit.obstacle else ())
+        obstacle = hand.fit.obstacle
+        return replace(result, notes=(obstacle,) if obstacle else (), obstacle=obstacle)
 
     # Reading
 
     def read_state(self, servo: str) -> Request[dict[str, Update]]:
-        """Return the read of position, status and what lies between; only of the position where the line cannot carry that."""
+        """Return the read of position, status and what lies between; only of the position where the line cannot carry that.
+
+        A hand that cannot be read across a gap brings the position and what lies between that and the speed.
+        """
         finger, hand = self._of(servo)
         model = hand.map
-        key = (servo, model.name)
+        key = (servo, model.name, hand.fit.gap)
         if key not in self._reads:
-            position, status = finger.address(model, finger.position_name), finger.address(model, "status")
-            start, end = min(position, status), max(position, status) + 1
+            position = finger.address(model, finger.position_name)
+            other = finger.address(model, "status" if hand.fit.gap is None else "speed")
+            start, end = min(position, other), max(position, other) + 1
             span = Span(start, end - start) if end - start <= self.limits.read else Span(position, 1)
             make = hand.trusted(model, lambda registers: {servo: finger.decode(model, span, registers)})
             self._reads[key] = hand.read(span, make)
         return self._reads[key]
 
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
-        """Return the fewest reads for each hand: positions for feedback, status and current for health.
+        """Return the fewest reads for each hand: positions for feedback, status, current and speed for health.
 
         How many they are depends on the map, which may be learned later. A poll that a map does not need makes no request.
         """
         polls = []
         for part, hz in rates.items():
             for unit, hand in self.hands.items():
-                count = max(len(self._poll_spans(part, hand, self._models[name])) for name in MAPS)
+                models = [self._models[name] for name in MAPS]
+                count = max(len(self._poll_spans(part, hand, model, gap)) for model in models for gap in (None, model.lite_gap))
                 polls += [Poll(part, hz, (unit,), partial(self._poll_request, part, hand, index)) for index in range(count)]
         return polls
 
-    def _poll_spans(self, part: str, hand: Hand, model: RohModel) -> list[Span]:
+    def _poll_spans(self, part: str, hand: Hand, model: RohModel, gap: int | None) -> list[Span]:
         addresses = {
             finger.address(model, name)
             for finger in hand.fingers
             for name in ((finger.position_name,) if part == "feedback" else HEALTH)
         }
-        return read_spans(addresses, self.limits.read)
+        return read_spans(addresses, self.limits.read, gap)
 
     def _poll_request(self, part: str, hand: Hand, index: int, reachable: Collection[int]) -> Request[dict[str, Update]] | None:
         if hand.unit not in reachable:
             return None
         model = hand.map
-        key = (part, hand.unit, index, model.name)
+        key = (part, hand.unit, index, model.name, hand.fit.gap)
         if key not in self._reads:
-            spans = self._poll_spans(part, hand, model)
+            spans = self._poll_spans(part, hand, model, hand.fit.gap)
             if index >= len(spans):
                 return None
             span = spans[index]
@@ -213,20 +224,22 @@ class RohDriver(Driver):
     # Motion
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Read the position, and write nothing: there is no torque command, and a finger holds its target anyway.
-
-        What the finger's registers hold is read too, so that a restart can be detected later. Raises DeviceError where nothing
-        may be written to the hand.
-        """
         finger, hand = self._of(servo)
-        finger.forget()
-        yield from hand.attach()
-        names = [finger.position_name, finger.target_name, "speed"]
-        names += ["current_limit"] if finger.options.torque_limit is not None else []
-        position, *held = yield from hand.explained(hand.read_values({finger: names}))
-        for value in held:
-            finger.held.confirm(value.name, value.raw)
-        return finger.calibration.to_unit(position.raw)
+        return hand.explained(enabling.enable(hand, finger))
+
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+        """Read the speeds of these fingers, one read for each hand; and their targets, where the same read brings them."""
+        lost: dict[str, Loss] = {}
+        for unit in dict.fromkeys(self.nodes[servo] for servo in servos):
+            hand = self.hands[unit]
+            fingers = [self.fingers[servo] for servo in servos if self.nodes[servo] == unit]
+            try:
+                kept = yield from hand.is_kept(_evidence(hand, fingers))
+            except ServobusError:
+                continue  # it did not show how it is; one that did not answer is doubtful now
+            if not kept:
+                lost |= {finger.name: Loss.RESTARTED for finger in fingers}
+        return lost
 
     def disable(self, servo: str) -> Plan[StopReport]:
         return stop.disable()
@@ -270,3 +283,11 @@ class RohDriver(Driver):
 
 def _nothing(registers: Sequence[int]) -> int | None:
     return None
+
+
+def _evidence(hand: Hand, fingers: Sequence[Finger]) -> dict[Finger, tuple[str, ...]]:
+    """Return the registers that show whether the hand has restarted."""
+    addresses = [finger.address(hand.map, name) for finger in fingers for name in ("speed", finger.target_name)]
+    if len(hand.spans(addresses)) == 1:
+        return {finger: ("speed", finger.target_name) for finger in fingers}
+    return dict.fromkeys(fingers, ("speed",))

@@ -13,7 +13,7 @@ from servobus.protocols.roh.model import FULL, RohModel, RohRegister
 from servobus.protocols.roh.options import CHANNELS, RohServo
 from servobus.protocols.roh.spans import Span
 from servobus.protocols.speed import goal_speed
-from servobus.values import ServoGoal, Update, is_number
+from servobus.values import Loss, ServoGoal, Update, is_number
 
 BY_UNIT = {"%": ("pos_target", "pos"), "deg": ("angle_target", "angle")}
 """Unit of a finger -> registers of its target and of its position."""
@@ -21,6 +21,8 @@ ROUNDING = {"%": 0, "deg": 100}
 """Steps by which a target may read back differently from what was written: the hand turns angles into positions."""
 MIN_STEP = 0.1
 """A finger arrives within about ten of these (% or degrees), however fine its registers are."""
+MAX_SPEED = FULL - 1
+"""The highest speed that is written. A hand starts with FULL in RAM, so a finger whose register holds that has restarted."""
 
 
 class HeldRegisters:
@@ -74,13 +76,37 @@ class Finger:
         self.target_name, self.position_name = BY_UNIT[self.unit]
         self.status: int | None = None
         """The status code as last read."""
+        self.own_current: int | None = None
+        """The current limit that the finger had before a goal with an effort changed it; None: not known."""
         self.held = HeldRegisters(self.target_name, ROUNDING[self.unit])
         self._fields = {"position": self.position_name, "goal": self.target_name, "current": "current"}
 
     def forget(self) -> None:
         """The hand has restarted, or it is another one."""
-        self.status = None
+        self.status = self.own_current = None
         self.held.forget()
+
+    def use_options(self, options: RohServo) -> None:
+        """Take options with the same channel and calibration."""
+        self.options = options
+
+    def begin(self, target: int, speed: int, current_limit: int) -> None:
+        """The finger is enabled with these registers. A current limit that is not the one of our last goal is its own."""
+        if self.own_current is None or current_limit != self.held.settings.get("current_limit"):
+            self.own_current = current_limit
+        self.held.forget()
+        for name, raw in ((self.target_name, target), ("speed", speed), ("current_limit", current_limit)):
+            self.held.confirm(name, raw)
+
+    def is_kept(self, name: str, raw: int) -> bool:
+        """Return whether this reading shows the register as it was left; False: the hand has restarted."""
+        has_begun = bool(self.held.targets)
+        return self.held.matches(name, raw) and not (has_begun and name == "speed" and raw > MAX_SPEED)
+
+    def near(self, raw: int, other: int, steps: float = 10.0) -> bool:
+        """Return whether two positions or targets are within so many of the finger's steps, which are not those of its
+        registers."""
+        return abs(raw - other) <= steps * self.step / abs(self.calibration.unit_per_step)
 
     @property
     def step(self) -> float:
@@ -107,7 +133,21 @@ class Finger:
         if span.contains(address):
             self.status = update["status"] = registers[address - span.start]
             update["moving"] = model.status_name(self.status) in model.moving
-        return update
+        return update | self._loss(model, span, registers)
+
+    def _loss(self, model: RohModel, span: Span, registers: Sequence[int]) -> Update:
+        """Return what these registers tell about a restart: all of it only where the speed is among them."""
+        if not self.held.targets:
+            return {}
+        kept = {}
+        for name in ("speed", self.target_name):
+            register = model.named(name)
+            address = register.address_of(self.channel)
+            if span.contains(address):
+                kept[name] = self.is_kept(name, register.from_word(registers[address - span.start]))
+        if not all(kept.values()):
+            return {"loss": Loss.RESTARTED}
+        return {"loss": None} if "speed" in kept else {}
 
     def faults(self, model: RohModel, status: int | None) -> tuple[str, ...]:
         name = model.status_name(self.status if status is None else status)
@@ -137,11 +177,16 @@ class Finger:
         return raw
 
     def wanted_settings(self, model: RohModel, goal: ServoGoal) -> dict[str, int]:
-        """Return the raw speed and, if the goal or the config has an effort, the raw current limit. Raises LimitError."""
+        """Return the raw speed and current limit: that of the goal's or the config's effort, else the finger's own.
+
+        Raises LimitError.
+        """
         settings = {"speed": self._raw_speed(model, goal_speed(goal, self.options, model_speed=0.0))}
         effort = goal.goal.effort or self.options.torque_limit
         if effort is not None:
             settings["current_limit"] = max(1, round(model.default_current * effort / 100))
+        elif self.own_current is not None:
+            settings["current_limit"] = self.own_current
         return settings
 
     def changed_settings(self, model: RohModel, goal: ServoGoal) -> dict[str, int]:
@@ -152,7 +197,7 @@ class Finger:
     def _raw_speed(self, model: RohModel, speed: float) -> int:
         """Return a speed (unit/s, 0: no limit) in logical positions/s. Angles and positions count as proportional."""
         if not speed:
-            return FULL
+            return MAX_SPEED
         raw = abs(self.calibration.rate_to_raw(speed))
         if self.unit == "deg":
             open_, closed = model.angles[self.options.channel]
@@ -161,7 +206,7 @@ class Finger:
             raise LimitError(
                 f"speed {speed:g} {self.unit}/s is above the hand's maximum, {speed * FULL / raw:g}", servo=self.name
             )
-        return max(1, min(FULL, round(raw)))
+        return max(1, min(MAX_SPEED, round(raw)))
 
     def check_raw(self, value: object) -> int:
         """Return a raw value for a register. Raises LimitError."""

@@ -33,7 +33,9 @@ SUB_EXCEPTIONS = {
     6: "saving failed",
 }
 """ROH Modbus, 3.4."""
-HARDWARE = {0x1B: "ROH-A001 or A002", 0x20: "ROH-AP001", 0x25: "ROH-LiteS001"}
+LITE = 0x25
+"""High byte of the hardware version of the LiteS001."""
+HARDWARE = {0x1B: "ROH-A001 or A002", 0x20: "ROH-AP001", LITE: "ROH-LiteS001"}
 """High byte of the hardware version -> product."""
 
 
@@ -45,6 +47,8 @@ class HandFit:
     """Its register map; None: not known."""
     obstacle: str = "it was not asked yet for its register map: is it powered, are id and baud rate right?"
     """Why nothing may be written to it; empty: it may be written."""
+    gap: int | None = None
+    """An address across which it cannot be read."""
 
 
 NOT_ASKED = HandFit()
@@ -106,7 +110,8 @@ class Hand:
         """Take the first registers of the hand."""
         before = self.fit.model
         model = map_of(registers, [self._models[name] for name in MAPS])
-        self.fit = HandFit(model, self._obstacle(model, registers))
+        gap = model.lite_gap if model is not None and _hardware(model, registers) >> 8 == LITE else None
+        self.fit = HandFit(model, self._obstacle(model, registers), gap)
         if before is not None and model is not before:
             self.forget()
 
@@ -162,17 +167,43 @@ class Hand:
             return {}
         return {finger.name: update for finger in fingers if (update := finger.decode(model, span, registers))}
 
-    def read_values(self, names: Mapping[Finger, Sequence[str]]) -> Plan[list[RegisterValue]]:
-        """Read registers of several fingers, in the fewest reads. Raises DeviceError for an incomplete reply."""
+    def spans(self, addresses: Iterable[int]) -> list[Span]:
+        """Return the cheapest reads of these addresses."""
+        return read_spans(addresses, self.limits.read, self.fit.gap)
+
+    def read_values(self, names: Mapping[Finger, Sequence[str]], *, pause: float = 0.0) -> Plan[list[RegisterValue]]:
+        """Read registers of several fingers, in the fewest reads. Raises DeviceError for an incomplete reply.
+
+        `pause`: seconds of silence after the last of them.
+        """
         model = self.map
         wanted = [(finger, name, finger.address(model, name)) for finger, some in names.items() for name in some]
         values: dict[int, int] = {}
-        for span in read_spans((address for _, _, address in wanted), self.limits.read):
-            registers = yield from ask(self.read(span, list))
+        spans = self.spans(address for _, _, address in wanted)
+        for span in spans:
+            request = self.read(span, list)
+            if span is spans[-1]:
+                request.quiet_after = max(request.quiet_after, pause)
+            registers = yield from ask(request)
             if not registers or len(registers) != span.count:
                 raise DeviceError(f"its reply to a read of {span.count} registers is incomplete: read again")
             values.update(zip(range(span.start, span.end), registers, strict=True))
         return [RegisterValue(finger, name, model.named(name).from_word(values[address])) for finger, name, address in wanted]
+
+    # Restarts
+
+    def is_kept(self, names: Mapping[Finger, Sequence[str]]) -> Plan[bool]:
+        """Return whether registers hold what they held; False: the hand has restarted. So has one that initialises."""
+        try:
+            values = yield from self.read_values(names)
+        except DeviceError as error:
+            if error.code != DEVICE_FAILURE:
+                raise
+        else:
+            if all(value.finger.is_kept(value.name, value.raw) for value in values):
+                return True
+        self.forget()
+        return False
 
     # Refusals
 
@@ -217,9 +248,14 @@ def identity(registers: Sequence[int], models: Iterable[RohModel]) -> Identity:
     if model is None:
         return Identity(product=f"unknown map: registers 1000 and 1001 read {_first_two(registers, ', ')}")
     start = model.named("fw_version").address - FIRST
-    firmware, revision, hardware = registers[start : start + 3]
+    firmware, revision = registers[start : start + 2]
+    hardware = _hardware(model, registers)
     product = HARDWARE.get(hardware >> 8, f"ROH hardware 0x{hardware:04X}")
     return Identity(model=model.name, product=product, firmware=f"{firmware >> 8}.{firmware & 0xFF}.{revision}", mode="position")
+
+
+def _hardware(model: RohModel, registers: Sequence[int]) -> int:
+    return registers[model.named("hw_version").address - FIRST]
 
 
 def _first_two(registers: Sequence[int], separator: str) -> str:

@@ -93,6 +93,8 @@ class RohModel(ServoModel):
     """Status names that are faults."""
     default_current: int
     """The factory's current limit in mA, which is 100 % effort."""
+    lite_gap: int | None = None
+    """The LiteS001 does not have the ten registers from here on, and refuses a read across them."""
     # For the simulated device only.
     reboot_s: float = 1.0
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from servobus.errors import DeviceError, NotSupported
 from servobus.protocols.base import Plan, Request, ask
-from servobus.protocols.roh.finger import BY_UNIT, Finger
+from servobus.protocols.roh.finger import BY_UNIT, MAX_SPEED, Finger
 from servobus.protocols.roh.hand import Hand
 from servobus.protocols.roh.model import RohModel, RohRegister
 from servobus.protocols.roh.spans import Span
@@ -64,6 +64,8 @@ class NamedWrite:
             yield from self._read_back(address, word)
         if register.name in ("speed", "current_limit"):
             self.finger.held.confirm(register.name, self.raw)
+        if register.name == "current_limit":
+            self.finger.own_current = self.raw
 
     def _read_back(self, address: int, word: int) -> Plan[None]:
         (reply,) = yield from ask(self.hand.read(Span(address, 1), list))
@@ -84,6 +86,8 @@ def named_write(finger: Finger, hand: Hand, name: str, value: Any, *, raw: bool,
     _refuse(finger, register, persist)
     count = finger.check_raw(value) if raw else register.to_raw(value)
     register.to_word(count)
+    if register.name == "speed":
+        count = min(count, MAX_SPEED)
     return NamedWrite(finger, hand, model, register, count)
 
 

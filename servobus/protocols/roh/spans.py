@@ -36,9 +36,13 @@ class Span:
         return self.start <= address < self.end
 
 
-def read_spans(addresses: Iterable[int], limit: int) -> list[Span]:
-    """Return the cheapest reads of all these addresses."""
-    return _joined(addresses, limit, MAX_UNWANTED)
+def read_spans(addresses: Iterable[int], limit: int, gap: int | None = None) -> list[Span]:
+    """Return the cheapest reads of all these addresses. `gap`: no read runs across this address, which the hand may not have."""
+    if gap is None:
+        return _joined(addresses, limit, MAX_UNWANTED)
+    wanted = set(addresses)
+    below = {address for address in wanted if address < gap}
+    return [*_joined(below, limit, MAX_UNWANTED), *_joined(wanted - below, limit, MAX_UNWANTED)]
 
 
 def write_spans(addresses: Iterable[int], limit: int) -> list[Span]:

@@ -1,23 +1,26 @@
 """Stops of fingers: target := present position. A hand has no torque command, so its fingers keep holding.
 
-A stop has three steps:
+A stop has four steps:
 
-1. Write the targets of all fingers whose present position is fresh enough; nothing is asked for that.
-2. Read the present positions of the hands that answer, and write them as targets again, acknowledged.
-3. Write to the hands that do not answer, twice and without waiting for a reply. They come last, so they delay nobody.
+1. Read where the fingers of the hands that answer are, and write that as their targets.
+2. Read the targets back, and the positions twice with a pause between. Only a finger that holds its target and rests is
+   confirmed: the reply to a write tells nothing of what the finger does.
+3. A hand that does not answer is written to twice, without waiting for a reply, where a finger was on its way when it was read
+   last and its place can be estimated. This comes after 1, so it delays nobody.
+4. Nothing else is written to a hand that does not answer: if it has restarted, a position would move it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from servobus.errors import LimitError, ServobusError
+from servobus.errors import LimitError, ReplyTimeout, ServobusError
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.modbus.requests import UnansweredWrite
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.goals import write_values
 from servobus.protocols.roh.hand import Hand, RegisterValue
-from servobus.protocols.roh.model import RohModel
+from servobus.protocols.roh.positions import Reading, locate, rest, rests
 from servobus.protocols.roh.spans import write_spans
 from servobus.values import StopReport, StopTarget
 
@@ -26,25 +29,33 @@ REPEATS = 2
 HOLDS = "a ROH hand has no torque command: the finger keeps holding"
 NOT_ENABLED = "it was not enabled: servobus does not move it"
 
-Targets = Sequence[tuple[Finger, StopTarget]]
+Targets = dict[Finger, StopTarget]
+Written = dict[Finger, int]
+"""The raw targets that hands have confirmed."""
+Failures = dict[Finger, ServobusError]
+OFFLINE = ReplyTimeout("offline: nothing was confirmed")
 
 
-def stop(hands: Mapping[int, Hand], targets: Targets) -> Plan[dict[str, StopReport]]:
+def stop(hands: Mapping[int, Hand], targets: Sequence[tuple[Finger, StopTarget]]) -> Plan[dict[str, StopReport]]:
     """Return the plan of a stop; see above."""
     reports = {finger.name: StopReport("none", False, True, NOT_ENABLED) for finger, target in targets if not target.enabled}
-    enabled = [(finger, target) for finger, target in targets if target.enabled]
-    present = {unit: [pair for pair in enabled if pair[0].node == unit and pair[1].reachable] for unit in hands}
-    absent = {unit: [pair for pair in enabled if pair[0].node == unit and not pair[1].reachable] for unit in hands}
-    written: set[Finger] = set()
-    for unit, some in present.items():
-        values = _fresh_targets(hands[unit], some)
-        failed = yield from write_values(hands[unit], values)
-        written |= {value.finger for value in values} - set(failed)
-    for unit, some in present.items():
-        reports |= yield from _hold(hands[unit], some, written)
-    for unit, some in absent.items():
-        reports |= yield from _write_unanswered(hands[unit], some)
-    return {finger.name: reports[finger.name] for finger, _ in targets}
+    enabled = {finger: target for finger, target in targets if target.enabled}
+    written: Written = {}
+    failed: Failures = {finger: OFFLINE for finger, target in enabled.items() if not target.reachable}
+    for unit, hand in hands.items():
+        reachable = {finger: target for finger, target in enabled.items() if finger.node == unit and target.reachable}
+        if reachable:
+            failed |= yield from _hold(hand, reachable, written)
+    for unit, hand in hands.items():
+        silent = {
+            finger: enabled[finger] for finger, error in failed.items() if finger.node == unit and isinstance(error, ReplyTimeout)
+        }
+        yield from _write_unanswered(hand, silent, written)
+    for unit, hand in hands.items():
+        held = [finger for finger in written if finger.node == unit and finger not in failed]
+        reports |= yield from _confirm(hand, held)
+    reports |= {finger.name: StopReport("hold", finger in written, False, error.message) for finger, error in failed.items()}
+    return {finger.name: _with_note(reports[finger.name], target) for finger, target in targets}
 
 
 def disable() -> Plan[StopReport]:
@@ -53,61 +64,72 @@ def disable() -> Plan[StopReport]:
     return StopReport("hold", False, True, HOLDS)
 
 
-def _fresh_targets(hand: Hand, targets: Targets) -> list[RegisterValue]:
-    """Return the targets that can be written without a question."""
-    values = []
-    for finger, target in targets:
-        raw = None if target.position is None or hand.fit.obstacle else _raw_target(finger, hand.map, target.position)
-        if raw is not None:
-            values.append(RegisterValue(finger, finger.target_name, raw))
-    return values
-
-
-def _raw_target(finger: Finger, model: RohModel, position: float) -> int | None:
-    try:
-        return finger.target_at(model, position)
-    except LimitError:
-        return None  # slightly outside the map's range: step 2 writes what the hand itself reports
-
-
-def _hold(hand: Hand, targets: Targets, written: set[Finger]) -> Plan[dict[str, StopReport]]:
-    """Read where the fingers are, and write that."""
-    failed: dict[Finger, ServobusError] = {}
+def _hold(hand: Hand, targets: Targets, written: Written) -> Plan[Failures]:
+    """Read where the fingers are, and write that. Returns the fingers that it failed for."""
     try:
         yield from hand.attach()
-        positions = yield from hand.explained(hand.read_values({finger: (finger.position_name,) for finger, _ in targets}))
-        failed = yield from write_values(hand, [RegisterValue(p.finger, p.finger.target_name, p.raw) for p in positions])
+        expected = {finger: _estimate(hand, finger, target) for finger, target in targets.items()}
+        places = yield from hand.explained(locate(hand, expected))
+        failed = yield from write_values(hand, [RegisterValue(finger, finger.target_name, raw) for finger, raw in places.items()])
     except ServobusError as error:
-        failed = {finger: error for finger, _ in targets}
-    return {finger.name: _report(finger, target, failed.get(finger), written) for finger, target in targets}
+        return dict.fromkeys(targets, error)
+    written |= {finger: raw for finger, raw in places.items() if finger not in failed}
+    return failed
 
 
-def _report(finger: Finger, target: StopTarget, error: ServobusError | None, written: set[Finger]) -> StopReport:
-    if error is not None:
-        return StopReport("hold", finger in written, False, error.message)
-    return StopReport("hold", True, True, HOLDS if target.kind == "limp" else "")
+def _confirm(hand: Hand, fingers: Sequence[Finger]) -> Plan[dict[str, StopReport]]:
+    if not fingers:
+        return {}
+    try:
+        readings = yield from hand.explained(rest(hand, fingers))
+    except ServobusError as error:
+        detail = f"its target was written, and not read back: {error.message}"
+        return {finger.name: StopReport("hold", True, False, detail) for finger in fingers}
+    return {finger.name: _report(finger, *readings[finger]) for finger in fingers}
 
 
-def _write_unanswered(hand: Hand, targets: Targets) -> Plan[dict[str, StopReport]]:
-    """Write the last positions of the fingers of a hand that does not answer, where they are known."""
+def _report(finger: Finger, before: Reading, now: Reading) -> StopReport:
+    detail = ""
+    if not finger.is_kept(finger.target_name, now.target):
+        detail = f"its target reads {_text(finger, now.target)} after another was written"
+    elif not rests(finger, before, now):
+        detail = f"it still moves: it was read at {_text(finger, before.position)}, then at {_text(finger, now.position)}"
+    return StopReport("hold", True, not detail, detail)
+
+
+def _text(finger: Finger, raw: int) -> str:
+    return f"{finger.calibration.to_unit(raw):.4g}"
+
+
+def _with_note(report: StopReport, target: StopTarget) -> StopReport:
+    limp = target.kind == "limp" and report.action == "hold" and report.confirmed
+    return StopReport("hold", report.written, confirmed=True, detail=HOLDS) if limp else report
+
+
+def _estimate(hand: Hand, finger: Finger, target: StopTarget) -> int | None:
+    """Return where a finger is taken to be, as a raw target; None: that is not known, or not in the finger's range."""
+    if target.position is None or hand.fit.obstacle:
+        return None
+    try:
+        return finger.target_at(hand.map, target.position)
+    except LimitError:
+        return None
+
+
+def _write_unanswered(hand: Hand, targets: Targets, written: Written) -> Plan[None]:
+    """Write where the fingers of a hand that does not answer are taken to be, as far as they were on their way."""
     model = hand.map
-    by_address = {value.finger.address(model, value.name): value for value in _fresh_targets(hand, targets)}
+    places = {finger: raw for finger, target in targets.items() if (raw := _estimate(hand, finger, target)) is not None}
+    by_address = {
+        finger.address(model, finger.target_name): RegisterValue(finger, finger.target_name, raw)
+        for finger, raw in places.items()
+        if not any(finger.near(goal, raw) for goal in finger.held.targets)
+    }
     for span in write_spans(by_address, hand.limits.write):
         group = [by_address[address] for address in range(span.start, span.end)]
         for value in group:
             value.finger.held.before_write(value.name, value.raw)
+            written[value.finger] = value.raw
+        registers = [model.named(value.name).to_word(value.raw) for value in group]
         for _ in range(REPEATS):
-            registers = [model.named(value.name).to_word(value.raw) for value in group]
             yield from ask(UnansweredWrite(hand.timing, hand.unit, span.start, registers))
-    written = {value.finger for value in by_address.values()}
-    return {
-        finger.name: StopReport(
-            "hold",
-            finger in written,
-            False,
-            "offline: nothing was confirmed"
-            if finger in written
-            else "offline, and its position is not known: nothing was written",
-        )
-        for finger, _ in targets
-    }

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request, run_plan
 from servobus.protocols.modbus.codec import Frame, ModbusCodec, encode, pack, unpack
+from servobus.protocols.modbus.requests import ReadHolding
 from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.model import load_models, packaged_models
 from servobus.protocols.roh.options import CHANNELS, RohBus
@@ -17,6 +18,8 @@ from servobus.values import Goal, Outcome, ServoGoal
 
 R = TypeVar("R")
 TRIES = 3
+GAP = 0.01
+"""Seconds: shorter silences after a request take no time here."""
 HAND: dict[str, dict[str, Any]] = {channel: {"id": 2, "channel": channel} for channel in CHANNELS}
 """All fingers of unit 2."""
 THREE: dict[str, dict[str, Any]] = {
@@ -68,6 +71,8 @@ class Bench:
         self.sent: list[Request[Any]] = []
         """The requests sent, including repetitions."""
         self.loses: Callable[[Request[Any]], bool] = lambda request: False
+        self.altered: list[tuple[int, int]] = []
+        """Addresses, and the words that the next reads of them bring instead of the right ones."""
 
     @property
     def hand(self) -> RohDevice:
@@ -78,7 +83,7 @@ class Bench:
         for _ in range(TRIES if request.idempotent else 1):
             self.sent.append(request)
             received = self._replies(request)
-            self.now += request.service_time
+            self.now += request.service_time + (request.quiet_after if request.quiet_after > GAP else 0.0)
             if not request.replies:
                 return request.parse(())
             if received:
@@ -90,8 +95,19 @@ class Bench:
         if not sent or self.loses(request):
             return []
         assert len(sent) == 1
-        reply = answer(sent[0])
+        reply = answer(self._alter(request, sent[0]))
         return [reply] if request.answers(reply) else []
+
+    def _alter(self, request: Request[Any], frame: bytes) -> bytes:
+        """Return the reply with another value, whose checksum is right."""
+        if not self.altered or not isinstance(request, ReadHolding):
+            return frame
+        (address, word), registers = self.altered[0], unpack(frame[3:-2])
+        if not request.address <= address < request.address + request.count:
+            return frame
+        del self.altered[0]
+        registers[address - request.address] = word
+        return encode(frame[0], frame[1], frame[2:3] + pack(registers))
 
     def run(self, plan: Plan[R]) -> R:
         return run_plan(plan, self.exchange)
@@ -111,6 +127,8 @@ class Bench:
         for servo in servos or self.driver.nodes:
             self.run(self.driver.enable(servo))
         self.frames()
+        for hand in self.devices:
+            hand.written.clear()
         return self
 
     def move(self, *goals: ServoGoal, together: bool = False) -> dict[str, Outcome | Exception]:

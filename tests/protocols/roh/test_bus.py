@@ -79,6 +79,8 @@ async def test_a_hand_is_identified_enabled_moved_and_stopped() -> None:
     async with running(HAND) as (bus, hands, events):
         for name in HAND:
             await bus.motion.enable(name)
+        assert hands[0].written == [(1125 + number, 65534) for number in range(6)], "one less than the hand starts with"
+        hands[0].written.clear()
         before = bus.stats.counts[Counter.FRAMES]
         results = await move(bus, **dict.fromkeys(HAND, 40.0))
         assert set(results.values()) == {Outcome.ACKED}

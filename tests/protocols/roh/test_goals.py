@@ -103,7 +103,7 @@ def test_a_speed_is_written_before_the_target_and_once() -> None:
     bench.move(goal("index", 0, speed=50))
     assert bench.frames() == ["unit 2 WRITE 1136 = 0"]
     bench.move(goal("index", 0))
-    assert bench.frames() == ["unit 2 WRITE 1126 = 65535", "unit 2 WRITE 1136 = 0"]
+    assert bench.frames() == ["unit 2 WRITE 1126 = 65534", "unit 2 WRITE 1136 = 0"]
 
 
 def test_a_goal_without_speed_and_effort_has_those_of_the_config() -> None:
@@ -127,7 +127,7 @@ def test_a_duration_becomes_a_speed() -> None:
     bench.move(goal("index", 50, start=0.0, duration=1))
     assert bench.frames()[0] == "unit 2 WRITE 1126 = 32768"
     bench.move(goal("index", 50, start=50.0, duration=1))
-    assert bench.frames()[0] == "unit 2 WRITE 1126 = 65535", "there already: any speed will do"
+    assert bench.frames()[0] == "unit 2 WRITE 1126 = 65534", "there already: any speed will do"
     bench.driver.check_goal(goal("index", 50, duration=1))
     error = bench.move(goal("index", 50, duration=1))["index"]
     assert isinstance(error, LimitError)
@@ -142,9 +142,9 @@ def test_degrees_a_second_become_positions_a_second() -> None:
 
 def test_speeds_at_the_edge() -> None:
     bench = Bench({"index": {**HAND["index"], "allow_max_speed": True}, "middle": HAND["middle"]}).enable()
-    for speed, raw in ((100, 65535), (0, 65535), (0.0001, 1)):
+    for speed, raw in ((100, 65534), (0, 65534), (0.0001, 1)):
         changes = bench.driver.fingers["index"].wanted_settings(bench.driver.hands[2].map, goal("index", 1, speed=speed))
-        assert changes == {"speed": raw}
+        assert changes == {"speed": raw, "current_limit": 1178}
     with pytest.raises(LimitError, match=r"speed 100.01 %/s is above the hand's maximum, 100"):
         bench.driver.check_goal(goal("index", 1, speed=100.01))
     with pytest.raises(LimitError, match="speed 0 means no limit"):

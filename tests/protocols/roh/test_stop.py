@@ -4,34 +4,41 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
+from servobus.protocols.base import Request
 from servobus.protocols.roh.options import CHANNELS
 from servobus.values import StopTarget
-from tests.protocols.roh.bench import Bench, all_fingers, three_hands
+from tests.protocols.roh.bench import Bench, all_fingers, goal, three_hands
 
 
 def target(servo: str, *, kind: Any = "hold", enabled: bool = True, **how: Any) -> StopTarget:
     return StopTarget(servo, kind, enabled, **how)
 
 
+READ_ALL = "unit 2 READ 1135 to 1150"
+
+
 def test_hold_is_target_to_present() -> None:
+    """Read, written, and read back twice: a position of a moment ago is where the finger was."""
     bench = Bench().enable()
     bench.move(*all_fingers(100))
     bench.after(0.25)
     bench.frames()
-    reports = bench.run(bench.driver.stop([target(name, position=20.0) for name in CHANNELS]))
+    reports = bench.run(bench.driver.stop([target(name, position=24.0) for name in CHANNELS]))
     assert [(report.action, report.written, report.confirmed) for report in reports.values()] == [("hold", True, True)] * 6
-    at_once, where, again = bench.frames()
-    assert at_once == "unit 2 WRITE 1135 to 1140 =" + " 13107" * 6
-    assert where == "unit 2 READ 1145 to 1150"
-    assert again == "unit 2 WRITE 1135 to 1140 =" + " 16384" * 6
+    assert bench.frames() == [READ_ALL, "unit 2 WRITE 1135 to 1140 =" + " 16384" * 6, READ_ALL, READ_ALL]
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes)), "a stop is no restart"
+    bench.after(2)
+    assert {round(finger.position) for finger in bench.hand.fingers} == {16384}
 
 
 def test_what_was_not_enabled_is_left_alone() -> None:
     bench = Bench().enable("index")
-    reports = bench.run(bench.driver.stop([target("index"), target("ring", enabled=False)]))
+    reports = bench.run(bench.driver.stop([target("index", position=0.0), target("ring", enabled=False)]))
     assert reports["ring"].action == "none"
-    assert bench.frames() == ["unit 2 READ 1146", "unit 2 WRITE 1136 = 0"]
+    read = "unit 2 READ 1136 to 1146"
+    assert bench.frames() == [read, "unit 2 WRITE 1136 = 0", read, read]
 
 
 def test_where_limp_was_wanted_it_holds_and_says_so() -> None:
@@ -41,28 +48,83 @@ def test_where_limp_was_wanted_it_holds_and_says_so() -> None:
     assert "no torque command" in bench.run(bench.driver.disable("ring")).detail
 
 
-def test_a_silent_hand_is_sent_its_last_positions_twice() -> None:
+@pytest.mark.parametrize("reachable", [True, False])
+def test_a_finger_on_its_way_is_sent_its_place_twice_where_its_hand_is_silent(reachable: bool) -> None:
+    """One that rested is sent nothing: if the hand has restarted, it would travel there."""
     bench = three_hands().enable()
+    bench.move(goal("legacy_index", 90))
+    bench.frames()
+    bench.loses = lambda request: request.node == 2
     gone = [
-        target("legacy_index", position=50.0, reachable=False),
-        target("legacy_ring", position=200.0, reachable=False),
-        target("v1_index", position=50.0),
+        target("legacy_index", position=50.0, reachable=reachable),
+        target("legacy_ring", position=0.2, reachable=reachable),
+        target("legacy_little", reachable=reachable),
+        target("v1_index", position=0.0),
     ]
     reports = bench.run(bench.driver.stop(gone))
-    assert bench.frames()[-2:] == ["unit 2 WRITE 1126 = 32768"] * 2
-    assert (reports["legacy_index"].written, reports["legacy_index"].confirmed) == (True, False)
-    assert (reports["legacy_ring"].written, reports["legacy_ring"].confirmed) == (False, False)
-    assert reports["v1_index"].confirmed
-    assert list(reports) == ["legacy_index", "legacy_ring", "v1_index"]
+    written = [frame for frame in bench.frames() if "WRITE" in frame]
+    assert written == ["unit 3 WRITE 1136 = 0", *["unit 2 WRITE 1126 = 32768"] * 2]
+    assert [(report.written, report.confirmed) for report in reports.values()] == [
+        (True, False), (False, False), (False, False), (True, True),
+    ]  # fmt: skip
+    assert list(reports) == ["legacy_index", "legacy_ring", "legacy_little", "v1_index"]
+    assert bench.driver.blind_stop(gone[0]) == (), "never a position again and again"
+
+
+def test_a_stop_is_confirmed_only_when_the_finger_rests() -> None:
+    """The reply to a write repeats address and count (ROH Modbus, 3.3): it tells nothing of what the finger does."""
+    bench = Bench().enable()
+    bench.move(goal("index", 100, speed=20))
+    bench.after(1).hand.ignores_targets = True
+    reports = bench.run(bench.driver.stop([target("index"), target("ring")]))
+    assert (reports["index"].written, reports["index"].confirmed, reports["ring"].confirmed) == (True, False, True)
+    assert "its target reads 100 after another was written" in reports["index"].detail
+    bench.hand.ignores_targets = False
+    assert bench.run(bench.driver.stop([target("index")]))["index"].confirmed
+
+
+def test_a_finger_that_holds_its_target_and_travels_on_is_not_confirmed() -> None:
+    bench = Bench().enable("index")
+    bench.hand.fingers[1].speed = 0
+
+    def travel(request: Request[Any]) -> bool:
+        bench.hand.fingers[1].position += 200
+        return False
+
+    bench.loses = travel
+    report = bench.run(bench.driver.stop([target("index")]))["index"]
+    assert (report.written, report.confirmed) == (True, False)
+    assert "it still moves: it was read at" in report.detail
+
+
+@pytest.mark.parametrize("altered", [65535, 40000])
+def test_one_altered_reading_moves_no_finger_that_is_stopped(altered: int) -> None:
+    bench = Bench().enable("index")
+    bench.altered = [(1146, altered)]
+    assert bench.run(bench.driver.stop([target("index")]))["index"].confirmed
+    assert bench.hand.written == [(1136, 0)]
 
 
 def test_a_stop_that_fails_says_what_was_written() -> None:
     bench = Bench().enable()
-    bench.loses = lambda request: request.frame[1] == 3
-    reports = bench.run(bench.driver.stop([target("index", position=0.0), target("ring")]))
+    asked = iter(range(100))
+    bench.loses = lambda request: request.frame[1] == 3 and next(asked) > 0
+    reports = bench.run(bench.driver.stop([target("index", position=0.0)]))
     assert (reports["index"].written, reports["index"].confirmed) == (True, False)
-    assert (reports["ring"].written, reports["ring"].confirmed) == (False, False)
+    assert "not read back" in reports["index"].detail
     bench.loses = lambda request: False
     bench.hand.state = "calibration"
-    reports = bench.run(bench.driver.stop([target("index")]))
+    reports = bench.run(bench.driver.stop([target("index", position=0.0)]))
+    assert (reports["index"].written, reports["index"].confirmed) == (False, False)
     assert "waits for its calibration" in reports["index"].detail
+
+
+@pytest.mark.parametrize("self_test", [0, 1])
+def test_a_hand_that_has_restarted_is_sent_nowhere(self_test: int) -> None:
+    bench = Bench().enable("index")
+    bench.move(goal("index", 60))
+    bench.after(2).hand.poke("self_test", 0, self_test)
+    bench.hand.reboot(bench.now)
+    stood = bench.after(10).hand.fingers[1].position
+    bench.run(bench.driver.stop([target("index", position=60.0)]))
+    assert bench.after(5).hand.fingers[1].position == stood

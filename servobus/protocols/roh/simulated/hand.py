@@ -40,6 +40,8 @@ class SimulatedHand:
         self.refuses_write_only = False
         """A write-only register is refused when it is read, instead of reading 0."""
         self.refuses_reads_while_busy = False
+        self.ignores_targets = False
+        """It confirms a target, and keeps the old one."""
         self.fails: dict[int, int] = {}
         """Address -> sub-exception with which a write to it is refused."""
         self.key = 0xCA11
@@ -79,7 +81,7 @@ class SimulatedHand:
             self.fingers[number] = SimulatedFinger(
                 finger.position, round(finger.position), current_limit=self.model.default_current
             )
-        self.state = "wait"
+        self.state = "wait" if "start_init" in self.model.registers else "work"
         if self.peek("self_test"):
             self._initialise(self._awake)
 
@@ -138,7 +140,7 @@ class SimulatedHand:
     # Effects of writes
 
     def _aim(self, channel: int, raw: int) -> None:
-        self.fingers[channel].target = raw
+        self._set_target(channel, raw)
         self.poke("angle_target", channel, self._angle(channel, raw))
 
     def _aim_angle(self, channel: int, raw: int) -> None:
@@ -146,9 +148,13 @@ class SimulatedHand:
         open_, closed = self._ends(channel)
         angle = max(min(open_, closed), min(max(open_, closed), raw))
         position = round(FULL * (angle - open_) / (closed - open_))
-        self.fingers[channel].target = position
+        self._set_target(channel, position)
         self.poke("pos_target", channel, position)
         self.poke("angle_target", channel, angle)
+
+    def _set_target(self, channel: int, raw: int) -> None:
+        if not self.ignores_targets:
+            self.fingers[channel].target = raw
 
     def _ends(self, channel: int) -> tuple[int, int]:
         open_, closed = self.model.angles[CHANNELS[channel]]
