@@ -64,6 +64,7 @@ async def test_the_same_verbs_as_on_a_line(generation: int) -> None:
         assert (await rig.identify("index")).model == "v2"
         assert await rig.ping("index") is None
         await rig.enable()
+        hand.written.clear()
         assert set((await rig.move(dict.fromkeys(FINGERS, 40.0))).values()) == {Outcome.ACKED}
         assert hand.written == [(1135 + number, 26214) for number in range(6)]
         assert (await rig["index"].settle()).position == pytest.approx(40, abs=1)

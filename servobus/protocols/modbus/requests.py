@@ -123,11 +123,15 @@ class ReadHolding(ModbusRequest[R]):
         return self.make(codec.unpack(data[1:]))
 
 
-class PresenceRead(ReadHolding[R | None]):
-    """A read that shows whether the unit is there. A refusal by the unit shows it too (None); a gateway's refusal does not."""
+class UnitRead(ReadHolding[R]):
+    """A read that only the unit itself answers: a gateway's refusal says nothing about the unit, so it counts as silence."""
 
     def answers(self, reply: Frame) -> bool:
         return super().answers(reply) and not (reply.function & REFUSED and reply.data[0] in GATEWAY)
+
+
+class PresenceRead(UnitRead[R | None]):
+    """A read that shows whether the unit is there. A refusal by the unit shows it too (None)."""
 
     def parse(self, replies: Sequence[Frame]) -> R | None:
         return None if replies[0].function & REFUSED else super().parse(replies)

@@ -163,7 +163,7 @@ class RohDriver(Driver):
             start, end = min(position, other), max(position, other) + 1
             span = Span(start, end - start) if end - start <= self.limits.read else Span(position, 1)
             make = hand.trusted(model, lambda registers: {servo: finger.decode(model, span, registers)})
-            self._reads[key] = hand.read(span, make)
+            self._reads[key] = hand.read_state(span, make)
         return self._reads[key]
 
     def polls(self, rates: Mapping[str, float]) -> Sequence[Poll]:
@@ -197,7 +197,7 @@ class RohDriver(Driver):
             if index >= len(spans):
                 return None
             span = spans[index]
-            self._reads[key] = hand.read(span, lambda registers: hand.updates(model, span, registers, hand.fingers))
+            self._reads[key] = hand.read_state(span, lambda registers: hand.updates(model, span, registers, hand.fingers))
         return self._reads[key]
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:

@@ -12,7 +12,15 @@ from typing import TypeVar
 
 from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Plan, Request, ask
-from servobus.protocols.modbus.requests import DEVICE_FAILURE, NO_ANSWER, ReadHolding, RtuTiming, WriteMultiple, WriteSingle
+from servobus.protocols.modbus.requests import (
+    DEVICE_FAILURE,
+    NO_ANSWER,
+    ReadHolding,
+    RtuTiming,
+    UnitRead,
+    WriteMultiple,
+    WriteSingle,
+)
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.model import NEWEST, RohModel
 from servobus.protocols.roh.options import MAPS
@@ -97,7 +105,7 @@ class Hand:
 
     def identity_read(self) -> ReadHolding[Sequence[int]]:
         """Return the read of the registers that tell the map."""
-        return ReadHolding(self.timing, self.unit, FIRST, IDENTITY_COUNT, list)
+        return UnitRead(self.timing, self.unit, FIRST, IDENTITY_COUNT, list)
 
     def attach(self) -> Plan[None]:
         """Ask for the map if it is not known. Raises DeviceError where nothing may be written."""
@@ -144,7 +152,12 @@ class Hand:
     # Reading and writing
 
     def read(self, span: Span, make: Callable[[Sequence[int]], R]) -> ReadHolding[R]:
+        """Return the read of any registers. A gateway's refusal is an answer: it refuses an illegal address in the same way."""
         return ReadHolding(self.timing, self.unit, span.start, span.count, make)
+
+    def read_state(self, span: Span, make: Callable[[Sequence[int]], R]) -> ReadHolding[R]:
+        """Return a read of registers that the hand has: a gateway's refusal is silence."""
+        return UnitRead(self.timing, self.unit, span.start, span.count, make)
 
     def write(self, address: int, values: Sequence[int], *, repeat: bool = True) -> Request[None]:
         if self._single_writes and len(values) == 1:
@@ -181,7 +194,7 @@ class Hand:
         values: dict[int, int] = {}
         spans = self.spans(address for _, _, address in wanted)
         for span in spans:
-            request = self.read(span, list)
+            request = self.read_state(span, list)
             if span is spans[-1]:
                 request.quiet_after = max(request.quiet_after, pause)
             registers = yield from ask(request)

@@ -55,7 +55,7 @@ def locate(hand: Hand, expected: Mapping[Finger, int | None]) -> Plan[dict[Finge
         return places[1]
     third = yield from read_fingers(hand, fingers)
     places.append({finger: reading.position for finger, reading in third.items()})
-    return {finger: sorted(place[finger] for place in places)[1] for finger in fingers}
+    return {finger: sorted(each[finger] for each in places)[1] for finger in fingers}
 
 
 def _is_close(finger: Finger, expected: int | None, position: int) -> bool:

@@ -49,7 +49,7 @@ def test_where_limp_was_wanted_it_holds_and_says_so() -> None:
 
 
 @pytest.mark.parametrize("reachable", [True, False])
-def test_a_finger_on_its_way_is_sent_its_place_twice_where_its_hand_is_silent(reachable: bool) -> None:
+def test_a_finger_on_its_way_is_sent_where_it_is_taken_to_be_if_its_hand_is_silent(reachable: bool) -> None:
     """One that rested is sent nothing: if the hand has restarted, it would travel there."""
     bench = three_hands().enable()
     bench.move(goal("legacy_index", 90))
