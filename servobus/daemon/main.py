@@ -17,6 +17,7 @@ from servobus.daemon.sockets import claim
 from servobus.daemon.watchdog import Pulse, Watchdog
 from servobus.engine.stats import Counter
 from servobus.errors import ServobusError
+from servobus.rig.latch import LatchFile
 from servobus.rig.local import LocalRig, open_rig
 from servobus.rig.logs import EventLogger
 
@@ -34,7 +35,7 @@ async def serve_rig(config: str, path: Path, log_every: float, opened: Callable[
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reloads.set)  # first: a SIGHUP before READY is done after it
     notifier, listener = Notifier(), claim(path)
     async with (
-        open_rig(config, degraded=True) as rig,
+        open_rig(config, degraded=True, latch=LatchFile(path.with_suffix(".estop"))) as rig,
         open_door(rig, path, owner=os.geteuid(), listener=listener) as door,
         anyio.create_task_group() as group,
     ):

@@ -35,6 +35,7 @@ Group={user}
 SupplementaryGroups=dialout
 RuntimeDirectory=servobus
 RuntimeDirectoryMode=0750
+RuntimeDirectoryPreserve=yes
 UMask=0117
 
 NoNewPrivileges=yes

@@ -20,6 +20,7 @@ from servobus.errors import Busy, GoalExpired, InvalidRequest, NotSupported, Unk
 from servobus.protocols.registry import PROTOCOLS
 from servobus.rig.events import Event, EventSource, EventStream
 from servobus.rig.interface import Rig
+from servobus.rig.latch import LatchFile
 from servobus.rig.logs import EventLogger
 from servobus.rig.results import outcomes, raise_failures, uncancelled
 from servobus.rig.supervisor import BusSupervisor, Trace
@@ -42,6 +43,7 @@ class LocalRig(Rig):
         only: Collection[str] = (),
         trace: Trace | None = None,
         path: Path | None = None,
+        latch: LatchFile | None = None,
     ) -> None:
         self.config = config
         self.path = path
@@ -56,6 +58,10 @@ class LocalRig(Rig):
         self._reloading: asyncio.Task[Reload] | None = None
         self.supervisors = {name: self._supervisor(name, config) for name in only or config.buses}
         self._index()
+        self._latch = latch
+        if latch is not None and latch.latched():  # each bus stops its servos when its line is open
+            log.warning("estop_latched", reason="it was latched before this process began: `servobus clear` releases it")
+            self._set_latch(latched=True)
 
     def _supervisor(self, name: str, config: Config) -> BusSupervisor:
         return BusSupervisor(name, config.buses[name], config.models[name], self._event, self._trace)
@@ -199,6 +205,7 @@ class LocalRig(Rig):
         await self._each(names, lambda bus, servo: bus.motion.disable(servo))
 
     async def stop(self) -> dict[str, StopReport]:
+        self._set_latch(latched=True)  # from the call on, before another goal can leave
         stopping = self._track(self._stop_all())
         return await asyncio.shield(stopping)  # a caller that is cancelled does not end it
 
@@ -221,11 +228,16 @@ class LocalRig(Rig):
     async def clear(self) -> tuple[str, ...]:
         if self._stopping:
             raise Busy("servos are still being stopped or parked: clear when they are at rest")
-        for bus in self.buses.values():
-            bus.stops.latched = False
+        self._set_latch(latched=False)
         owed = tuple(f"{name}/{servo}" for name, bus in self.buses.items() for servo in bus.stops.owed)
         self._event(EventName.ESTOP_CLEARED, owed=owed)
         return owed
+
+    def _set_latch(self, *, latched: bool) -> None:
+        for bus in self.buses.values():
+            bus.stops.latched = latched
+        if self._latch is not None:
+            self._latch.set(latched=latched)
 
     @property
     def stopped(self) -> bool:
@@ -348,7 +360,12 @@ class LocalRig(Rig):
 
 @asynccontextmanager
 async def open_rig(
-    config: str | Path | Config, *, buses: Collection[str] = (), degraded: bool = False, trace: Trace | None = None
+    config: str | Path | Config,
+    *,
+    buses: Collection[str] = (),
+    degraded: bool = False,
+    trace: Trace | None = None,
+    latch: LatchFile | None = None,
 ) -> AsyncIterator[LocalRig]:
     """Own the ports of a config until the context ends; then each servo enabled here is left as its `on_exit` says.
 
@@ -357,6 +374,7 @@ async def open_rig(
         buses: Names of the buses to open; none: all.
         degraded: True: a port that cannot be opened is waited for; False: it raises.
         trace: Called with (bus, sent, bytes, monotonic seconds) for everything on the wire, both ways.
+        latch: Where the e-stop's latch is kept through a restart; None: it ends with the context.
 
     Returns: A context manager whose value is a LocalRig.
     Raises: ConfigError, PortMissing, PortBusy, PortDenied, LinkDown.
@@ -365,7 +383,7 @@ async def open_rig(
     setup = config if isinstance(config, Config) else load_config(config)
     failure: BaseException | None = None
     async with anyio.create_task_group() as supervisors:
-        rig = LocalRig(setup, supervisors, buses, trace, path)
+        rig = LocalRig(setup, supervisors, buses, trace, path, latch)
         try:
             await rig.start(degraded=degraded)
             yield rig

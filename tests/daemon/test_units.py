@@ -29,6 +29,7 @@ def test_the_unit_says_what_the_daemon_does() -> None:
     assert service["ExecStart"] == "servobus run rig.yaml"
     assert (service["Type"], service["Restart"], service["RestartPreventExitStatus"]) == ("notify", "on-failure", "2")
     assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("servobus", "0750")
+    assert service["RuntimeDirectoryPreserve"] == "yes", "the e-stop's latch is kept there"
     assert "PrivateDevices" not in service, "it would hide the ports"
 
 
