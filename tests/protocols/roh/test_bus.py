@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,9 @@ from servobus.errors import DeviceError, ReplyTimeout
 from servobus.links.faulty import FaultyEnd
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
+from servobus.protocols.device import Device, DeviceReply
+from servobus.protocols.modbus.codec import REFUSED, Frame, encode
+from servobus.protocols.modbus.requests import NO_ANSWER
 from servobus.protocols.options import FaultOptions
 from servobus.protocols.roh import DEFINITION
 from servobus.protocols.roh.simulated.device import RohDevice
@@ -41,21 +44,42 @@ FAULTS = {
 TWO = {"a": {"id": 2, "channel": "index"}, "b": {"id": 2, "channel": "ring"}, "c": {"id": 3, "channel": "index"}}
 
 
+class Gateway:
+    """What an arm makes of a hand that does not answer: the exception "the unit did not answer", after its own timeout."""
+
+    def __init__(self, hand: RohDevice) -> None:
+        self.hand = hand
+        self.baudrate = hand.baudrate
+
+    @property
+    def node(self) -> int:
+        return self.hand.node
+
+    def handle(self, packet: Frame, now: float) -> Sequence[DeviceReply]:
+        replies = self.hand.handle(packet, now)
+        if replies or packet.unit != self.node:
+            return replies
+        return (DeviceReply(encode(packet.unit, packet.function | REFUSED, bytes((NO_ANSWER,))), 0.02),)
+
+
 @asynccontextmanager
 async def running(
-    servos: dict[str, dict[str, Any]], faults: FaultOptions | None = None, **keys: Any
+    servos: dict[str, dict[str, Any]], faults: FaultOptions | None = None, *, behind_arm: bool = False, **keys: Any
 ) -> AsyncIterator[tuple[BusService, list[RohDevice], list[str]]]:
     """Return the service of a line, its hands, and the names of its events."""
     loop = asyncio.get_running_loop()
-    options = bus_options(servos, poll={"feedback": 20, "health": 5}, **keys)
+    options = bus_options(servos, **{"poll": {"feedback": 20, "health": 5}, **keys})
     models = DEFINITION.models(options, Path())
     events: list[str] = []
     hands = [device for device in DEFINITION.devices(options, models) if isinstance(device, RohDevice)]
-    line = SimulatedLine(hands, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
+    nodes: list[Device] = [Gateway(hand) if behind_arm else hand for hand in hands]
+    line = SimulatedLine(nodes, DEFINITION.device_codec(options), loop, baudrate=options.baudrate)
     with closing(line):
         far = line if faults is None else FaultyEnd(line, faults, loop, rename=DEFINITION.rename, node_of=DEFINITION.node_of)
         paced = faults is None or not faults.echo
-        link = MemoryLink(far, LineTraits(options.baudrate, paced=paced, can_change_baud=True))
+        carried = (12, 10) if behind_arm else (None, None)
+        traits = LineTraits(options.baudrate, paced=paced, can_change_baud=True, max_read=carried[0], max_write=carried[1])
+        link = MemoryLink(far, traits)
         driver = DEFINITION.driver(options, models)
         bus = BusService(
             "hand", options, driver, DEFINITION.codec(options), link.traits, lambda name, **fields: events.append(name)
