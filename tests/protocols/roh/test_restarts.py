@@ -92,7 +92,7 @@ async def test_a_hand_that_is_off_goes_offline(behind_arm: bool) -> None:
         with pytest.raises(ReplyTimeout):
             await bus.read("a")
         hands[0].dead = False
-        await asyncio.sleep(2)
+        await asyncio.sleep(5)
         assert bus.state("a").health is Health.ONLINE
 
 
@@ -188,7 +188,7 @@ def test_a_finger_that_holds_something_keeps_its_target() -> None:
     bench = Bench()
     finger = bench.hand.fingers[1]
     finger.position, finger.target, finger.obstacle = 30000.0, 65535, 30000.0
-    bench.after(2)
+    bench.after(0).after(2)
     bench.run(bench.driver.enable("index"))
     assert targets_written(bench.hand) == []
 
