@@ -26,24 +26,6 @@ P = TypeVar("P", bound=BaseModel)
 VERSION = 1
 KEYS = ("version", "buses", "access", "door")
 REQUIRED = ("version", "buses")
-BUS_KEYS_TAKEN = {"poll", "goal_rate", "servos"}
-"""Keys of a bus that it takes anew while it runs; of `servos`, those below."""
-SERVO_KEYS_TAKEN = {
-    "acceleration",
-    "allow_max_speed",
-    "limits",
-    "max_speed",
-    "max_step",
-    "on_estop",
-    "on_exit",
-    "on_limit",
-    "on_lost_client",
-    "park_pose",
-    "park_timeout",
-    "speed",
-    "torque_limit",
-    "ttl",
-}
 _name = TypeAdapter(Name)
 
 
@@ -66,13 +48,7 @@ class Config:
         """Whether both configs have this bus, with the same line, ids, models and calibration; other keys may differ."""
         if bus not in self.buses or bus not in other.buses:
             return False
-        return _fixed_keys(self.buses[bus]) == _fixed_keys(other.buses[bus]) and self.models[bus] == other.models[bus]
-
-
-def _fixed_keys(options: BusOptions) -> Mapping[str, Any]:
-    """The keys of a bus that a running bus cannot take anew."""
-    servos = {name: servo.model_dump(exclude=SERVO_KEYS_TAKEN) for name, servo in options.servos.items()}
-    return {**options.model_dump(exclude=BUS_KEYS_TAKEN), "servos": servos}
+        return self.buses[bus].is_live_change(other.buses[bus]) and self.models[bus] == other.models[bus]
 
 
 def load_config(path: str | Path) -> Config:

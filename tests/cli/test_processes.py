@@ -69,6 +69,47 @@ def test_a_reload_by_signal(rig: str) -> None:
         assert process.wait(10) == 0
 
 
+def test_a_signal_never_opens_a_bus_again_whose_servo_is_enabled(rig: str) -> None:
+    with servobus("run", rig) as process:
+        until(process, "running")
+        with servobus("enable", "elbow") as enabling:
+            enabling.communicate(timeout=20)
+        text = Path(rig).read_text()
+        Path(rig).write_text(text.replace("id: 1", "id: 9"))
+        process.send_signal(signal.SIGHUP)
+        assert "opens again arm, while these servos are enabled or owe a stop: arm/elbow" in str(
+            until(process, "reload_refused")["reason"]
+        )
+        with servobus("read", "elbow", "--json") as reading:
+            assert json.loads(reading.communicate(timeout=20)[0])["arm/elbow"]["enabled"] is True
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+def test_clear_names_the_stops_that_are_owed(rig: str, tmp_path: Path) -> None:
+    """The servos are deaf while their line stands still."""
+    with servobus("sim", rig) as sim:
+        assert sim.stdout is not None
+        real = tmp_path / "real.yaml"
+        real.write_text(LIMP.replace('"sim:"', sim.stdout.readline().split()[1]))
+        with servobus("run", str(real)) as daemon:
+            until(daemon, "running")
+            with servobus("enable") as enabling:
+                assert enabling.wait(20) == 0
+            sim.send_signal(signal.SIGSTOP)
+            with servobus("stop") as stopping:
+                assert stopping.wait(20) == 1
+            with servobus("clear", "--json") as clearing:
+                out, _ = clearing.communicate(timeout=20)
+                assert json.loads(out) == {"released": True, "owed": ["arm/shoulder", "arm/elbow"]}
+            with servobus("clear") as clearing:
+                assert "still owed: the stop of arm/shoulder, arm/elbow" in clearing.communicate(timeout=20)[1]
+            sim.send_signal(signal.SIGCONT)
+            until(daemon, "stop_paid")
+            daemon.terminate()
+            assert daemon.wait(10) == 0
+
+
 def test_the_commands_talk_to_the_daemon(rig: str) -> None:
     """Enable, move, stop and clear by processes of their own, each without a config."""
     with servobus("run", rig) as daemon:

@@ -12,6 +12,7 @@ import pytest
 
 from servobus.errors import (
     ActionWithheld,
+    Busy,
     ConfigError,
     DeviceError,
     EStopped,
@@ -269,6 +270,12 @@ async def test_reading_the_config_anew(over: Over, tmp_path: Path) -> None:
         assert list(rig.snapshot()) == list(rig.names)
         await rig["s3"].enable()
         assert await rig["s3"].move_to(1) is Outcome.ACKED
+        two_buses(tmp_path, leg=5)
+        with pytest.raises(Busy, match="arm/s3"):
+            await rig.reload()
+        assert (await rig.reload(force=True)).changed == ("arm", "leg")
+        two_buses(tmp_path, ", s3: {id: 3, model: sts}", leg=4)
+        await rig.reload()
         path.write_text("version: 1\n")
         with pytest.raises(ConfigError, match=r"two\.yaml"):
             await rig.reload()
