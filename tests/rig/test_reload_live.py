@@ -26,9 +26,9 @@ def write(path: Path, protocol: str, *, bus: str = "poll: {feedback: 50}", keys:
 
 
 async def position(rig: LocalRig) -> float:
-    found = (await rig["s1"].read()).position
-    assert found is not None
-    return found
+    state = await rig["s1"].read()
+    assert state.position is not None
+    return state.position
 
 
 @every_protocol
