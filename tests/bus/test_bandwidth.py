@@ -36,15 +36,15 @@ def test_polls_count_question_pause_and_answer() -> None:
     sms = "a: {id: 1, model: sms}"
     load = load_of(sms, poll="{feedback: 50, health: 2}")
     read = 8 * BYTE + TURNAROUND
-    assert load.shares["feedback"] == pytest.approx(100 * 50 * (read + (6 + 11) * BYTE))
-    assert load.shares["health"] == pytest.approx(100 * 2 * (read + (6 + 15) * BYTE))
+    assert load.shares["feedback"] == pytest.approx(100 * 50 * (read + (6 + 27) * BYTE))
+    assert load.shares["health"] == pytest.approx(100 * 2 * (read + (6 + 31) * BYTE))
     assert load.shares["goals"] > 0, "goals are counted at the feedback rate"
 
 
 def test_latencies() -> None:
     load = load_of("a: {id: 1, model: sms}", poll="{health: 1}", latency=0.002, timeout_ms="10")
-    longest = 8 * BYTE + TURNAROUND + 21 * BYTE
-    stop = 2 * 11 * BYTE  # the goal, said twice
+    longest = 8 * BYTE + TURNAROUND + (6 + 31) * BYTE
+    stop = 8 * BYTE + TURNAROUND + (6 + 34) * BYTE + 11 * BYTE  # mode to moving are read, and the present position is the goal
     assert load.estop_latency == pytest.approx(longest + stop + 0.002)
     assert load.silent_latency == pytest.approx(0.010 + 0.002)
 

@@ -12,7 +12,7 @@ import pytest
 from servobus.errors import Busy, DeviceError, EStopped, LinkDown, NotEnabled, ReplyTimeout
 from servobus.protocols.sms.codec import Instruction, encode
 from servobus.values import Goal, Outcome, ServoGoal
-from tests.engine.scripted_line import Answers, puppet_bus
+from tests.engine.scripted_line import Answers, Puppet, puppet_bus, table_of
 from tests.virtual_time import virtual
 
 PARKED = "s1: {id: 1, model: sts, on_estop: park, park_pose: 10, park_timeout: 0.5}"
@@ -38,15 +38,13 @@ async def test_a_checked_goal_brings_the_bytes_that_are_sent() -> None:
         assert await bus.motion.send("s1", checked.goal, confirm=False) is Outcome.ACKED
 
 
-def keeping() -> Callable[[bytes], Answers | None]:
-    """A servo that keeps what is written."""
-    memory: dict[int, bytes] = {}
+def keeping(puppet: Puppet) -> Callable[[bytes], Answers | None]:
+    """A servo that keeps what is written; its torque is off at first."""
+    puppet.tables = {node: table_of(node, torque_enable=0) for node in (1, 2)}
 
     def script(frame: bytes) -> Answers | None:
         if frame[4] == Instruction.WRITE:
-            memory[frame[5]] = frame[6:-1]
-        elif frame[4] == Instruction.READ and frame[5] in memory:
-            return [(0.001, encode(frame[2], 0, memory[frame[5]][: frame[6]]))]
+            puppet.tables[frame[2]].write(frame[5], frame[6:-1])
         return None
 
     return script
@@ -55,7 +53,7 @@ def keeping() -> Callable[[bytes], Answers | None]:
 @virtual
 async def test_enable_identifies_the_servo_first() -> None:
     async with puppet_bus(started=False) as (bus, puppet, _, _):
-        puppet.script = keeping()
+        puppet.script = keeping(puppet)
         await bus.motion.enable("s1")
         assert bus.records["s1"].enabled
         identity = bus.records["s1"].identity
@@ -66,13 +64,13 @@ async def test_enable_identifies_the_servo_first() -> None:
 @virtual
 async def test_an_e_stop_in_the_moment_in_which_enable_succeeds_wins() -> None:
     async with puppet_bus() as (bus, puppet, _, _):
-        keep = keeping()
+        keep = keeping(puppet)
 
         def script(frame: bytes) -> Answers | None:
-            answers = keep(frame)
-            if answers and frame[4:6] == bytes((Instruction.READ, 40)):
+            keep(frame)
+            if frame[4] == Instruction.READ and puppet.tables[1].data[40]:
                 bus.stops.latched = True  # the last answer is on its way
-            return answers
+            return None
 
         puppet.script = script
         with pytest.raises(EStopped, match="while the servo was being enabled"):
@@ -82,9 +80,10 @@ async def test_an_e_stop_in_the_moment_in_which_enable_succeeds_wins() -> None:
 
 @virtual
 async def test_a_servo_that_does_not_take_its_goal_stays_disabled() -> None:
-    async with puppet_bus() as (bus, _, _, _):
+    async with puppet_bus() as (bus, puppet, _, _):
+        puppet.tables[1] = table_of(1, torque_enable=0)  # whatever is written
         with pytest.raises(DeviceError, match="arm/s1"):
-            await bus.motion.enable("s1")  # a puppet's torque reads 0 whatever is written
+            await bus.motion.enable("s1")
         assert not bus.records["s1"].enabled
 
 
@@ -112,7 +111,7 @@ async def test_disable_is_refused_in_an_exclusive_session() -> None:
 @pytest.mark.parametrize("how", ["disabled", "restarted"])
 async def test_settle_fails_when_the_servo_is_disabled_or_restarts(how: str) -> None:
     async with puppet_bus() as (bus, puppet, _, _):
-        puppet.script = keeping()
+        puppet.script = keeping(puppet)
         await bus.motion.enable("s1")
         bus.records["s1"].goal = 50.0
         settling = asyncio.create_task(bus.motion.settle("s1", tolerance=None, timeout=5))
@@ -121,7 +120,8 @@ async def test_settle_fails_when_the_servo_is_disabled_or_restarts(how: str) -> 
         if how == "disabled":
             await bus.motion.disable("s1")
         else:
-            puppet.script = lambda frame: None  # its torque reads 0 again
+            puppet.script = lambda frame: None
+            puppet.tables[1].restart()
             bus.nodes.suspect_all()
         with pytest.raises(NotEnabled, match=r"arm/s1.*before it arrived at its goal"):
             await settling
@@ -131,7 +131,7 @@ async def test_settle_fails_when_the_servo_is_disabled_or_restarts(how: str) -> 
 async def test_a_stop_while_the_position_is_read_is_not_taken_for_arrival() -> None:
     """The hold puts the setpoint where it stands; a read that was under way then would find it there."""
     async with puppet_bus() as (bus, puppet, _, _):
-        keep, asked = keeping(), asyncio.Event()
+        keep, asked = keeping(puppet), asyncio.Event()
         puppet.script = keep
         await bus.motion.enable("s1")
         bus.records["s1"].goal = 50.0
@@ -187,7 +187,7 @@ async def test_the_e_stop_ends_an_enable_under_way() -> None:
 @virtual
 async def test_a_servo_that_does_not_arrive_at_its_park_pose_goes_limp() -> None:
     async with puppet_bus(PARKED) as (bus, puppet, _, _):
-        puppet.script = keeping()
+        puppet.script = keeping(puppet)
         await bus.motion.enable("s1")
         report = await bus.motion.park("s1")
         assert (report.action, report.written, report.confirmed) == ("park", True, False)

@@ -11,16 +11,28 @@ from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
 from servobus.protocols.registry import PROTOCOLS
 from servobus.protocols.sms.codec import Instruction, SmsCodec, encode
+from servobus.protocols.sms.model import packaged_models
+from servobus.protocols.sms.simulated.registers import RegisterTable
 from tests.simulated_rigs import config
 
 Answers = Sequence[tuple[float, bytes]]
 """Seconds from the question, bytes."""
 
 
+def table_of(node: int, **registers: int) -> RegisterTable:
+    """The memory of an STS as `enable` leaves it, and what else these registers hold."""
+    table = RegisterTable(packaged_models()["sts"])
+    for name, raw in {"id": node, "torque_enable": 1, "acceleration": 254, **registers}.items():
+        table.put(table.registers[name], raw)
+    return table
+
+
 class Puppet:
-    """Answers READ with the id where that is read and else with zeros, and all else with health 0, until `script` is set."""
+    """Answers READ from a memory that no write changes, and all else with health 0, until `script` is set."""
 
     def __init__(self) -> None:
+        self.tables: dict[int, RegisterTable] = {}
+        """Node -> its memory; an enabled STS that stands at step 0 unless a test puts another one there."""
         self.script: Callable[[bytes], Answers | None] = lambda frame: None
         """None: as usual."""
         self.frames: list[bytes] = []
@@ -48,18 +60,22 @@ class Puppet:
         """Now, unasked."""
         self._deliver(data)
 
-    @staticmethod
-    def usual(data: bytes) -> Answers:
+    def usual(self, data: bytes) -> Answers:
         codec = SmsCodec()
         codec.receive_data(data)
         packet = codec.next_reply()
         assert packet is not None
+        if packet.code == Instruction.SYNC_READ:
+            return [(0.001, self._reply(node, *packet.params[:2])) for node in packet.params[2:]]
         if packet.id == 0xFE:
             return []
         if packet.code != Instruction.READ:
             return [(0.001, encode(packet.id, 0))]
-        address, size = packet.params
-        return [(0.001, encode(packet.id, 0, bytes(packet.id if address + at == 5 else 0 for at in range(size))))]
+        return [(0.001, self._reply(packet.id, *packet.params))]
+
+    def _reply(self, node: int, address: int, size: int) -> bytes:
+        table = self.tables.get(node) or self.tables.setdefault(node, table_of(node))
+        return encode(node, 0, table.read(address, size))
 
 
 class Events(list[str]):

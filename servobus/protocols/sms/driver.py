@@ -1,29 +1,30 @@
 """The FEETECH driver: the requests of each verb (SMS 1.0; FEETECH memory tables). Sans-IO.
 
-The parts: `reading` (state, polls, registers), `settings` (writes by name), `goals` and `packer` (motion), `stop`, `identity`.
+The parts: `identity` (and what it learns), `reading` (state, polls, registers), `settings` (writes by name), `goals` and `packer`
+(motion), `enable`, `stop`, `armed` (REG WRITEs that wait).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
-from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
 from servobus.protocols.fence import fence
+from servobus.protocols.sms.armed import Armed
 from servobus.protocols.sms.codec import MAX_ID
+from servobus.protocols.sms.enable import Enabler
 from servobus.protocols.sms.goals import GoalWriter
-from servobus.protocols.sms.identity import identify, inspect, learn_mode
+from servobus.protocols.sms.identity import identify, inspect
 from servobus.protocols.sms.model import SmsModel
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.packer import PackedGoal
 from servobus.protocols.sms.reading import Reader
-from servobus.protocols.sms.requests import Fence, Ping, Write
+from servobus.protocols.sms.requests import Fence, Ping
 from servobus.protocols.sms.servo import HostServo
 from servobus.protocols.sms.settings import SettingWriter
 from servobus.protocols.sms.stop import Stopper
-from servobus.values import Identity, ServoGoal, StopReport, StopTarget, Update
+from servobus.values import Identity, Loss, ServoGoal, StopReport, StopTarget, Update
 
 FENCE_SIZES = range(3, 27)
 """Lengths of a fence's READ, which are the keys of its replies. Never two bytes: the echo of a READ has two parameters."""
@@ -37,10 +38,23 @@ class SmsDriver(Driver):
         self.servos = {name: HostServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: servo.node for name, servo in self.servos.items()}
         self._servo_at = {servo.node: servo for servo in self.servos.values()}
+        self._armed = Armed(options, self.servos)
+        self._take(options)
+
+    def _take(self, options: SmsBus) -> None:
+        """Make the parts that follow from the options."""
+        self.options = options
         self._reader = Reader(options, self.servos)
         self._settings = SettingWriter(options)
-        self._goals = GoalWriter(options, self.servos)
-        self._stopper = Stopper(options)
+        self._goals = GoalWriter(options, self.servos, self._armed)
+        self._stopper = Stopper(options, self._armed)
+
+    def use_options(self, options: SmsBus) -> bool:
+        """Take other rates, limits, speeds and policies; ids, models and calibrations are as they were."""
+        for name, servo in self.servos.items():
+            servo.options = options.servos[name]
+        self._take(options)
+        return True
 
     # Addressing
 
@@ -55,16 +69,19 @@ class SmsDriver(Driver):
         """A READ of a length that no reply under way has; then the sentinel, where the servo is enabled."""
         yield from fence(lambda size: ask(Fence(node, size)), FENCE_SIZES, avoid)
         servo = self._servo_at.get(node)
-        if servo is None or not enabled:
+        if servo is None:
+            return True
+        self._armed.suspect(node)
+        if not enabled:
             return True
         sentinel = servo.model.sentinel
         return (yield from ask(servo.read_raw(servo.model.registers[sentinel.name]))) != sentinel.reset
 
     def inspect(self, node: int) -> Plan[Identity]:
-        return inspect(node)
+        return inspect(node, self._armed)
 
     def identify(self, servo: str) -> Plan[Identity]:
-        return identify(self.servos[servo], self.options)
+        return identify(self.servos[servo], self.options, self._armed)
 
     # Reading and writing
 
@@ -90,41 +107,20 @@ class SmsDriver(Driver):
         return self.servos[servo].calibration.unit_per_step
 
     def enable(self, servo: str) -> Plan[float | None]:
-        """Mode, settings, goal := present, torque on, read back. An enable that fails half-way ends with torque off."""
-        host = self.servos[servo]
-        yield from learn_mode(host)
-        try:
-            return (yield from self._energise(host))
-        except ServobusError:
-            with suppress(ServobusError):
-                yield from ask(self._torque(host, b"\x00"))
-            raise
-
-    def _energise(self, servo: HostServo) -> Plan[float | None]:
-        model, packer = servo.model, self._goals.packers[servo.name]
-        velocity = servo.fit.mode == "velocity"
-        servo.held = {}
-        for name, raw in packer.settings(None, None).items():
-            register = model.registers[name]
-            yield from ask(self._settings.request(servo, register, servo.encode(register, raw)))
-            servo.hold({name: raw})
-        present = yield from ask(servo.read_raw(model.registers[model.state["position"]]))
-        register, goal = (servo.speed, 0) if velocity else (servo.position, present)
-        yield from ask(Write(servo.node, *packer.first_goal(present), answered=self.options.writes_answered))
-        yield from ask(self._torque(servo, b"\x01"))
-        taken = (yield from ask(servo.read_raw(register))) == goal
-        if not (taken and (yield from ask(servo.read_raw(model.registers[model.torque])))):
-            raise DeviceError("the servo did not take its present position as goal: it stays disabled", servo=servo.name)
-        return None if velocity else servo.calibration.to_unit(present)
-
-    def _torque(self, servo: HostServo, data: bytes) -> Write:
-        return self._settings.request(servo, servo.model.registers[servo.model.torque], data)
+        """Settings, goal := present, torque on, read back. An enable that fails half-way ends with torque off."""
+        return Enabler(self.servos[servo], self._goals.packers[servo], self.options, self._armed).plan()
 
     def disable(self, servo: str) -> Plan[StopReport]:
         return self._stopper.disable(self.servos[servo])
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
         return self._stopper.stop([(self.servos[target.servo], target) for target in targets])
+
+    def verify(self, servos: Sequence[str]) -> Plan[Mapping[str, Loss]]:
+        return self._reader.verify(servos)
+
+    def blind_stop(self, target: StopTarget) -> Sequence[Request[Any]]:
+        return self._stopper.blind(self.servos[target.servo], target)
 
     def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
         return self._stopper.preview([(self.servos[target.servo], target) for target in targets])

@@ -1,12 +1,7 @@
 """How goals reach FEETECH servos: one WRITE, one SYNC WRITE, or one REG WRITE each and one ACTION.
 
-The rule of REG WRITE and ACTION (SMS 1.0, 1.3.4 and 1.3.5). A servo whose acknowledgement is missing may be armed all the same,
-and a later ACTION would move it. So every servo that is sent a REG WRITE is in `maybe_armed` until one of these is known:
-1. ACTION was sent for it;
-2. its flag register was read as 0;
-3. a harmless REG WRITE has replaced the goal, and an ACTION of its own was acknowledged.
-ACTION to all is withheld while any other servo may be armed. The plan may be closed at any frame, because a servo enters
-`maybe_armed` before its first frame leaves.
+A REG WRITE waits in its servo until ACTION (SMS 1.0, 1.3.4 and 1.3.5). `armed` keeps who may hold one, and ACTION to all is
+withheld while anybody else does. A plan may be closed at any frame: a servo enters that table before its REG WRITE leaves.
 """
 
 from __future__ import annotations
@@ -16,6 +11,7 @@ from typing import Any
 
 from servobus.errors import ActionWithheld, NotSupported, ReplyTimeout, ServobusError, UnknownName
 from servobus.protocols.base import GoalPlan, Plan, Request, ask
+from servobus.protocols.sms.armed import Armed, read_flag
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.packer import GoalPacker, PackedGoal
 from servobus.protocols.sms.requests import Action, RegWrite, SyncWrite, Write, sync_write_size
@@ -31,11 +27,10 @@ Results = dict[str, Outcome | Exception]
 class GoalWriter:
     """Packs goals and plans their turns."""
 
-    def __init__(self, options: SmsBus, servos: Mapping[str, HostServo]) -> None:
+    def __init__(self, options: SmsBus, servos: Mapping[str, HostServo], armed: Armed) -> None:
         self.options = options
         self.packers = {name: GoalPacker(servo) for name, servo in servos.items()}
-        self.maybe_armed: dict[int, HostServo] = {}
-        """Node -> servo that may hold a REG WRITE."""
+        self._armed = armed
 
     def check(self, goal: ServoGoal) -> PackedGoal:
         """Return the packed goal. A duration whose start is not known yet is packed as if the servo were there already."""
@@ -86,6 +81,11 @@ class GoalWriter:
         return SyncWrite(part.address, {part.servo.node: part.data for part in parts})
 
     def _write_frame(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
+        for part in parts:
+            if part.settings:
+                part.servo.forget(part.settings)
+            if self._armed.sent(part.servo.node):
+                yield from self._armed.disarm_ours((part.servo.node,))
         request = self._frame(parts)
         yield request
         for part in parts:
@@ -96,9 +96,10 @@ class GoalWriter:
     # REG WRITE and ACTION
 
     def _reg_write_action(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
-        self.maybe_armed |= {part.servo.node: part.servo for part in parts}
         results: Results = {}
         for part in parts:
+            self._armed.arming(part.servo.node)
+            part.servo.forget(part.settings)
             try:
                 yield from self._arm(part)
                 results[part.servo.name] = Outcome.ACKED
@@ -109,12 +110,13 @@ class GoalWriter:
         if reason:
             for part in armed:
                 results[part.servo.name] = ActionWithheld(f"not moved: {reason}", servo=part.servo.name)
-                yield from self._disarm(part.servo)
+                yield from self._armed.disarm(part.servo)
             return results
         yield from ask(Action())
+        for part in parts:
+            self._armed.fired(part.servo.node)
         for part in armed:
             part.servo.hold(part.settings)
-            self.maybe_armed.pop(part.servo.node, None)
         return results
 
     def _reg_write(self, part: PackedGoal) -> RegWrite:
@@ -122,7 +124,7 @@ class GoalWriter:
 
     def _arm(self, part: PackedGoal) -> Plan[None]:
         yield from ask(self._reg_write(part))
-        if not self.options.writes_answered and not (yield from _flag(part.servo)):
+        if not self.options.writes_answered and not (yield from ask(read_flag(part.servo.node))):
             raise ReplyTimeout("the servo did not take the REG WRITE: its flag reads 0", servo=part.servo.name)
 
     def _obstacle(self, parts: Sequence[PackedGoal], armed: Sequence[PackedGoal]) -> Plan[str]:
@@ -132,36 +134,7 @@ class GoalWriter:
         silent = [part.servo.name for part in parts if part not in armed]
         if silent and self.options.on_partial == "abort":
             return f"{', '.join(silent)} did not acknowledge its REG WRITE (on_partial: abort)"
-        reason = ""
-        for node in sorted(self.maybe_armed.keys() - {part.servo.node for part in parts}):
-            reason = reason or (yield from self._suspicion(self.maybe_armed[node]))
-        return reason
-
-    def _suspicion(self, servo: HostServo) -> Plan[str]:
-        """Ask a servo whether it is armed and disarm it; return why ACTION must still be withheld, or nothing."""
-        try:
-            pending = yield from _flag(servo)
-        except ServobusError:
-            pending = 1
-        if pending:
-            yield from self._disarm(servo)
-        else:
-            self.maybe_armed.pop(servo.node, None)
-        reason = f"{servo.name} may hold an older REG WRITE that ACTION would carry out, and does not answer"
-        return reason if servo.node in self.maybe_armed else ""
-
-    def _disarm(self, servo: HostServo) -> Plan[None]:
-        """Replace the waiting goal by a write that moves nothing (the sentinel's own value), and let the servo carry it out."""
-        sentinel = servo.model.sentinel
-        register = servo.model.registers[sentinel.name]
-        harmless = servo.encode(register, servo.held.get(register.name, sentinel.value))
-        answered = self.options.writes_answered
-        try:
-            yield from ask(RegWrite(servo.node, register.address, harmless, answered=answered))
-            yield from ask(Action(servo.node, answered=answered))
-        except ServobusError:
-            return  # it remains in maybe_armed, and withholds the next ACTION
-        self.maybe_armed.pop(servo.node, None)
+        return (yield from self._armed.obstacle({part.servo.node for part in parts}))
 
 
 def max_frame_size(options: SmsBus) -> int:
@@ -186,7 +159,3 @@ def _require_flags(parts: Sequence[PackedGoal]) -> None:
                 "set its response level to 1 and status_return to all",
                 servo=part.servo.name,
             )
-
-
-def _flag(servo: HostServo) -> Plan[int]:
-    return (yield from ask(servo.read_raw(servo.model.register("async_write_flag"))))

@@ -17,8 +17,13 @@ from servobus.protocols.sms.options import SmsBus
 from servobus.values import GoalKind
 
 StateField = Literal["position", "goal", "speed", "load", "current", "voltage", "temperature", "moving", "status"]
+Mode = Literal["position", "velocity", "pwm", "step", "motor"]
+"""position: to a place; velocity: at a speed; pwm and motor: by the PWM word, which is the second register of the goal; step: a
+goal is a number of steps to go from here."""
 LAST_ADDRESS = 255
-SETTINGS_AT_START = ("response_status_level", "min_angle_limit", "max_angle_limit")
+LIMITS = ("min_angle_limit", "max_angle_limit")
+"""The stored limits, the lower one first."""
+SETTINGS_AT_START = ("response_status_level", *LIMITS)
 """Registers that every servo is asked for when it is identified; every model must have them."""
 
 
@@ -45,11 +50,33 @@ class Sentinel(Data):
     reset: int
 
 
-class Wheel(Data):
-    """How wheel mode is recognised."""
+class Family(Data):
+    """Which servos have this memory table, by what they report at addresses 2 to 4."""
 
-    registers: dict[str, int]
-    """Register -> its value in wheel mode; all of them must match."""
+    end: Literal[0, 1]
+    """Byte order (END, address 2): 0 little, 1 big."""
+    majors: list[int] = []
+    """Values of address 3 that belong to this family, whatever address 4 is."""
+    products: list[Pair[int]] = []
+    """Further servos of this family: values of the addresses 3 and 4."""
+
+    def covers(self, end: int, major: int, minor: int) -> bool:
+        """Return whether a servo that reports these bytes is of this family."""
+        return end == self.end and (major in self.majors or (major, minor) in self.products)
+
+
+class SpeedUnit(Data):
+    """The bit that chooses the unit of speed."""
+
+    name: str
+    """The register that holds it."""
+    bit: Annotated[int, Field(ge=0, le=7)]
+    units: Pair[Annotated[float, Field(gt=0)]]
+    """Steps/s of a count while the bit is 0, and while it is 1."""
+
+    def scale(self, raw: int) -> float:
+        """Return steps/s of a count, for a value of the register."""
+        return self.units[raw >> self.bit & 1]
 
 
 class SmsModel(ServoModel):
@@ -69,8 +96,14 @@ class SmsModel(ServoModel):
     state: dict[StateField, str]
     """Field of State -> register."""
     sentinel: Sentinel
-    wheel: Wheel | None = None
-    """None: position only."""
+    family: Family
+    modes: Annotated[dict[Mode, dict[str, int]], Field(min_length=1)]
+    """Mode -> registers and their values in it. The first mode whose values all match is the servo's; one that matches none
+    is in a mode that this model does not know, and is not moved."""
+    speed_unit: SpeedUnit | None = None
+    """None: the scale of the registers holds for every servo."""
+    supported: dict[str, list[int]] = {}
+    """Register -> the values with which everything else of this file is true. A servo with another one is not moved."""
     time_is_ms: bool = False
     """The time register is the duration of the motion in milliseconds, used when speed is 0 (SCS); else it remains 0."""
     sync_read: bool = False
@@ -84,7 +117,32 @@ class SmsModel(ServoModel):
 
     @property
     def kinds(self) -> tuple[GoalKind, ...]:
-        return ("position", "velocity") if self.wheel else ("position",)
+        """The kinds of goals that this model takes, each in the mode of its name."""
+        kinds: tuple[GoalKind, ...] = ("position", "velocity")
+        return tuple(kind for kind in kinds if kind in self.modes)
+
+    @property
+    def mode_registers(self) -> tuple[str, ...]:
+        """The registers that decide about the mode."""
+        return tuple(dict.fromkeys(name for registers in self.modes.values() for name in registers))
+
+    @property
+    def settings_at_start(self) -> tuple[str, ...]:
+        """The registers that a servo is asked for when it is identified."""
+        unit = () if self.speed_unit is None else (self.speed_unit.name,)
+        return tuple(dict.fromkeys((*SETTINGS_AT_START, *self.mode_registers, *unit, *self.supported)))
+
+    def mode(self, registers: Mapping[str, int]) -> str:
+        """Return the mode of a servo whose registers have these values; "mode N" where this model does not know it."""
+        for mode, values in self.modes.items():
+            if all(registers[name] == value for name, value in values.items()):
+                return mode
+        return f"mode {', '.join(str(registers[name]) for name in self.mode_registers)}"
+
+    def speed_scale(self, registers: Mapping[str, int]) -> float:
+        """Return steps/s of a count of speed, for a servo whose registers have these values."""
+        unit = self.speed_unit
+        return self.registers[self.goal[2]].scale if unit is None else unit.scale(registers[unit.name])
 
     @property
     def goal_ranges(self) -> dict[str, tuple[float, float]]:
@@ -101,13 +159,12 @@ class SmsModel(ServoModel):
 
     @model_validator(mode="after")
     def _parts_exist(self) -> Self:
-        wheel = self.wheel.registers if self.wheel else {}
-        parts = [*self.goal, *self.feedback, *self.health, self.torque, self.lock]
-        for name in [*parts, self.sentinel.name, *self.state.values(), *wheel]:
-            if name not in self.registers:
-                raise ValueError(f"{name} is named as a part, but the map has no such register")
         if missing := [name for name in SETTINGS_AT_START if name not in self.registers]:
             raise ValueError(f"registers: {', '.join(missing)} must be there, because every servo is asked for them")
+        parts = [*self.goal, *self.feedback, *self.health, self.torque, self.lock]
+        for name in [*parts, self.sentinel.name, *self.state.values(), *self.settings_at_start]:
+            if name not in self.registers:
+                raise ValueError(f"{name} is named as a part, but the map has no such register")
         if "position" not in self.state:
             raise ValueError("state: position must be there, because enable and hold begin from it")
         position, time, speed = (self.registers[name] for name in self.goal)

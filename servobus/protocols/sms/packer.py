@@ -1,7 +1,7 @@
 """Goals of one servo as bytes.
 
-The goal block is position, time and speed (SMS 1.0, example 4), or the speed alone in wheel mode. Acceleration and torque limit
-are registers beside it, so they travel in the same frame; they are sent only while the servo does not hold the wanted value.
+The goal block is position, time and speed (SMS 1.0, example 4), or the speed alone in velocity mode. Acceleration and torque
+limit are registers beside it, so they travel in the same frame, while the servo does not hold the wanted value.
 A block is packed by one `struct` that is made once for each combination of registers.
 """
 
@@ -57,28 +57,37 @@ class GoalPacker:
 
     def __init__(self, servo: HostServo) -> None:
         self.servo = servo
-        self.default_speed = self._default_speed()
-        """Raw speed of a goal that names none."""
         sentinel = servo.model.sentinel
         self.rest_time = sentinel.value if sentinel.name == servo.time.name else 0
         """Raw time while the speed rules: 0, or the sentinel where this register is the sentinel."""
-        self._position, self._time, self._speed = map(servo.word_maker, (servo.position, servo.time, servo.speed))
+        self._fit: Fit | None = None
+        """What the servo reported when the parts below were made: they follow from its unit of speed and its limits."""
         self._usual: tuple[Layout, int, int] | None = None
         """Layout, time and speed of a plain position goal; made for the first one."""
-        self._layouts: dict[tuple[GoalKind, tuple[str, ...]], Layout] = {}
+        self._layouts: dict[tuple[str, tuple[str, ...]], Layout] = {}
         self._missing: Mapping[str, int] = {}
         """Settings that a plain goal must bring, while the servo holds `_missing_for`."""
         self._missing_for: Mapping[str, int] | None = None
+        self._refit()
+
+    def _refit(self) -> None:
+        """Make what follows from what the servo reported."""
+        servo = self.servo
+        self._fit, self._usual, self._missing_for = servo.fit, None, None
+        self.default_speed = self._default_speed()
+        """Raw speed of a goal that names none."""
+        self._position, self._time, self._speed = map(servo.word_maker, (servo.position, servo.time, servo.speed))
 
     def pack(self, goal: ServoGoal, settings: Mapping[str, int] | None = None) -> PackedGoal:
         """Return the goal as bytes, with these settings; None: with those that the servo does not hold."""
         servo, wanted = self.servo, goal.goal
-        mode = servo.fit.mode
-        if wanted.kind != mode:
-            raise NotSupported(self._wrong_mode(wanted.kind), servo=servo.name)
+        if wanted.kind != servo.takes:
+            raise NotSupported(self._refusal(wanted.kind), servo=servo.name)
+        if self._fit is not servo.fit:
+            self._refit()
         if settings is None:
             settings = self.missing_settings(wanted)
-        if settings or mode != "position" or wanted.speed is not None or wanted.duration is not None:
+        if settings or wanted.kind != "position" or wanted.speed is not None or wanted.duration is not None:
             address, data = self._pack_all(goal, settings)
         else:
             address, data = self._pack_position(servo.calibration.to_raw(wanted.value))
@@ -103,7 +112,9 @@ class GoalPacker:
         return layout.address, layout.pack(*values)
 
     def first_goal(self, present: int) -> tuple[int, bytes]:
-        """Return address and bytes of the goal that enable() writes: the present raw position, or speed 0 in wheel mode."""
+        """Return address and bytes of the goal that enable() writes: the present raw position, or speed 0 in velocity mode."""
+        if self._fit is not self.servo.fit:
+            self._refit()
         if self.servo.fit.mode == "position":
             return self._pack_position(present)
         layout = self._layout(())
@@ -113,26 +124,28 @@ class GoalPacker:
 
     def missing_settings(self, goal: Goal) -> Mapping[str, int]:
         """Return the settings (raw) that this goal needs and the servo does not hold."""
-        plain = goal.acceleration is None and goal.effort is None
-        if plain and self.servo.fit.mode == "velocity":
-            return {}  # enable() wrote them, and acceleration is not beside the speed
         held = self.servo.held
-        if not plain:
+        if goal.acceleration is not None or goal.effort is not None:
             return _missing(self.settings(goal.acceleration, goal.effort), held)
         if self._missing_for is not held:
-            self._missing, self._missing_for = _missing(self.settings(None, None), held), held
+            settings = self.settings(None, None)
+            if self.servo.fit.mode == "velocity":
+                settings.pop("acceleration", None)  # enable() wrote it, and it is not beside the speed
+            self._missing, self._missing_for = _missing(settings, held), held
         return self._missing
 
     def settings(self, acceleration: float | None, effort: float | None) -> dict[str, int]:
-        """Return the raw acceleration and torque limit of a motion: the goal's, else the config's, else the sentinel's."""
+        """Return the raw acceleration and torque limit of a motion: the goal's, else the config's, else the servo's own.
+
+        An acceleration that is the sentinel always has a value, so that a restart shows.
+        """
         servo, sentinel = self.servo, self.servo.model.sentinel
-        settings: dict[str, int] = {}
+        settings = {sentinel.name: sentinel.value} if sentinel.name == "acceleration" else {}
+        settings |= servo.own
         acceleration = acceleration or servo.options.acceleration
         if acceleration is not None:
             register = self._setting("acceleration", "an acceleration")
             settings["acceleration"] = max(1, servo.to_raw(register, acceleration))  # 0 means no limit
-        elif sentinel.name == "acceleration":
-            settings["acceleration"] = sentinel.value
         effort = effort or servo.options.torque_limit
         if effort is not None:
             settings["torque_limit"] = self._setting("torque_limit", "a torque limit").to_raw(effort)
@@ -174,12 +187,13 @@ class GoalPacker:
 
     def _raw_speed(self, speed: float) -> int:
         """At least 1, because 0 means no limit on the wire."""
-        return max(1, abs(round(self.servo.calibration.rate_to_raw(speed) / self.servo.speed.scale)))
+        return max(1, abs(self.servo.to_raw(self.servo.speed, speed)))
 
     def _default_speed(self) -> int:
         speed = default_speed(self.servo.options, 0.0)
-        model = self.servo.model
-        return self._raw_speed(speed) if speed else round((model.default_speed or 1.0) / self.servo.speed.scale)
+        if not speed:
+            speed = self.servo.calibration.rate_to_unit(self.servo.model.default_speed or 1.0)
+        return self._raw_speed(speed)
 
     # Layouts
 
@@ -187,7 +201,7 @@ class GoalPacker:
         key = (self.servo.fit.mode, settings)
         return self._layouts.get(key) or self._new_layout(*key)
 
-    def _new_layout(self, mode: GoalKind, settings: tuple[str, ...]) -> Layout:
+    def _new_layout(self, mode: str, settings: tuple[str, ...]) -> Layout:
         """Make the layout of a goal with these settings. Raises NotSupported where the registers do not follow one another."""
         servo = self.servo
         goal = [servo.speed] if mode == "velocity" else [servo.position, servo.time, servo.speed]
@@ -206,11 +220,13 @@ class GoalPacker:
         self._layouts[mode, settings] = layout
         return layout
 
-    def _wrong_mode(self, kind: GoalKind) -> str:
-        model, mode = self.servo.model, self.servo.fit.mode
+    def _refusal(self, kind: GoalKind) -> str:
+        model, fit = self.servo.model, self.servo.fit
+        if fit.obstacle:
+            return fit.obstacle
         if kind not in model.kinds:
             return f"model {model.name} takes {', '.join(model.kinds)} goals only"
-        return f"the servo is in {mode} mode and cannot take a {kind} goal: change its mode registers while it is disabled"
+        return f"the servo is in {fit.mode} mode and cannot take a {kind} goal: change its mode registers while it is disabled"
 
 
 def _missing(settings: Mapping[str, int], held: Mapping[str, int]) -> dict[str, int]:

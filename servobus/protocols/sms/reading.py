@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
-from servobus.protocols.base import Poll, Request
+from servobus.errors import ServobusError
+from servobus.protocols.base import Plan, Poll, Request, ask
 from servobus.protocols.sms.codec import OVERHEAD
 from servobus.protocols.sms.goals import MAX_FRAME_SECONDS
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read, SyncRead
 from servobus.protocols.sms.servo import HostServo
 from servobus.protocols.spans import parse_span
-from servobus.values import Update
+from servobus.values import Loss, Update
 
+Decoder = Callable[[bytes], Update]
 TABLE_SIZE = 256
+MAX_MISSED = 5
+"""SYNC READs in a row that the same servo may miss before its group is asked one by one. A dead servo is offline before."""
+RETRY_AFTER = 100
+"""Requests after which it is asked together once more."""
 MAX_READ = 250
 """Bytes that one READ brings at most: its reply counts them and two more in one byte."""
 
@@ -28,6 +35,7 @@ class Reader:
         self.registers: dict[tuple[str, str, bool], Request[Any]] = {}
         """The reads that were made already, by servo, register and `raw`."""
         self._states = {name: _state_read(servo) for name, servo in servos.items()}
+        self._guards = self._blocks({servo.name: (servo.guard_span, servo.decode_guards) for servo in servos.values()})
 
     def state(self, name: str) -> Request[dict[str, Update]]:
         """Return the read of the whole state."""
@@ -47,44 +55,90 @@ class Reader:
     @staticmethod
     def _register_read(servo: HostServo, name: str, *, raw: bool) -> Read[Any]:
         register = servo.model.readable(name)
-        return servo.read_raw(register) if raw else servo.read_physical(register)
+        return servo.read_raw(register) if raw else servo.read_physical(servo.in_unit(register))
 
     def polls(self, rates: Mapping[str, float]) -> list[Poll]:
         """Return the polls: SYNC READ for the servos that know it and share a block, one READ for each of the others."""
-        return [poll for name, hz in rates.items() for poll in self._polls(name, hz)]
+        return [Poll(name, hz, block.nodes, block.request) for name, hz in rates.items() for block in self._polled(name)]
 
-    def _polls(self, name: str, hz: float) -> list[Poll]:
+    def _polled(self, name: str) -> list[BlockRead]:
+        feedback = name == "feedback"
+        return self._blocks(
+            {
+                servo.name: (servo.model.feedback, servo.decode_feedback)
+                if feedback
+                else (servo.model.health, servo.decode_state)
+                for servo in self.servos.values()
+            }
+        )
+
+    def verify(self, servos: Collection[str]) -> Plan[Mapping[str, Loss]]:
+        """Return the plan that reads torque and sentinel of these servos, and names those that are not as they were left."""
+        nodes = [self.servos[name].node for name in servos]
+        losses: dict[str, Loss] = {}
+        for block in self._guards:
+            updates = yield from _ask_all(block, [node for node in block.nodes if node in nodes])
+            losses |= {name: update["loss"] for name, update in updates.items() if update["loss"] is not None}
+        return losses
+
+    def _blocks(self, wanted: Mapping[str, tuple[tuple[str, str], Decoder]]) -> list[BlockRead]:
+        """Return the fewest reads of these blocks, which are given by their first and last register."""
         groups: dict[tuple[int, int, int], list[HostServo]] = {}
-        for servo in self.servos.values():
-            block = servo.model.block(*(servo.model.feedback if name == "feedback" else servo.model.health))
+        for name, (ends, _) in wanted.items():
+            servo = self.servos[name]
             alone = 0 if servo.model.sync_read else servo.node + 1
-            groups.setdefault((*block, alone), []).append(servo)
-        polls = []
+            groups.setdefault((*servo.model.block(*ends), alone), []).append(servo)
+        blocks = []
         for (address, size, _), servos in groups.items():
-            count = max(1, int(MAX_FRAME_SECONDS * self.options.baudrate / 10) // (size + OVERHEAD))
+            count = max_replies(self.options, size)
             for start in range(0, len(servos), count):
-                block_read = BlockRead(name, address, size, servos[start : start + count])
-                polls.append(Poll(name, hz, block_read.nodes, block_read.request))
-        return polls
+                decoders = {servo.node: (servo.name, wanted[servo.name][1]) for servo in servos[start : start + count]}
+                blocks.append(BlockRead(address, size, decoders))
+        return blocks
+
+
+def max_replies(options: SmsBus, size: int) -> int:
+    """Return how many servos one SYNC READ asks for `size` bytes each: at least 1."""
+    return max(1, int(MAX_FRAME_SECONDS * options.baudrate / 10) // (size + OVERHEAD))
 
 
 class BlockRead:
-    """One poll: the same block of several servos. It keeps its last request, because the same servos answer nearly always."""
+    """The same block of several servos. It keeps its last request, because the same servos are asked nearly always.
 
-    def __init__(self, name: str, address: int, size: int, servos: Sequence[HostServo]) -> None:
+    Where the same servo is always missing from a SYNC READ though it answers when it is asked alone (noise between two replies),
+    one servo after another is asked instead, for a while.
+    """
+
+    def __init__(self, address: int, size: int, decoders: Mapping[int, tuple[str, Decoder]]) -> None:
         self.address, self.size = address, size
-        self.nodes = tuple(servo.node for servo in servos)
-        self._decoders: dict[int, tuple[str, Callable[[bytes], Update]]] = {
-            servo.node: (servo.name, servo.decode_feedback if name == "feedback" else servo.decode_state) for servo in servos
-        }
+        self.nodes = tuple(decoders)
+        self._decoders = decoders
         self._last: tuple[list[int], Request[dict[str, Update]] | None] = ([], None)
+        self._missed: dict[int, int] = {}
+        """Node -> SYNC READs in a row that it did not answer."""
+        self._alone = 0
+        """Requests for which servos are asked alone."""
 
     def request(self, reachable: Collection[int]) -> Request[dict[str, Update]] | None:
         """Return the read of the reachable servos; None: none is reachable."""
         nodes = [node for node in self.nodes if node in reachable]
+        if len(nodes) > 1:
+            nodes = self._together_or_one(nodes)
         if nodes != self._last[0]:
             self._last = (nodes, self._make(nodes))
         return self._last[1]
+
+    def _together_or_one(self, nodes: list[int]) -> list[int]:
+        missed = self._missed
+        for node in nodes:
+            missed[node] = missed.get(node, 0) + 1
+        if not self._alone and max(missed[node] for node in nodes) > MAX_MISSED:
+            self._alone = RETRY_AFTER
+            missed.clear()
+        if self._alone:
+            self._alone -= 1
+            return [nodes[self._alone % len(nodes)]]
+        return nodes
 
     def _make(self, nodes: Sequence[int]) -> Request[dict[str, Update]] | None:
         if not nodes:
@@ -95,11 +149,26 @@ class BlockRead:
         return Read(nodes[0], self.address, self.size, lambda data: {name: decode(data)})
 
     def _decode(self, data: Mapping[int, bytes]) -> dict[str, Update]:
+        self._missed.update(dict.fromkeys(data, 0))
         updates = {}
         for node, block in data.items():
             name, decode = self._decoders[node]
             updates[name] = decode(block)
         return updates
+
+
+def _ask_all(block: BlockRead, nodes: Sequence[int]) -> Plan[dict[str, Update]]:
+    """Read a block of these nodes: together, and alone where that failed. Who does not answer is left out: it is doubtful now."""
+    together = block.request(nodes)
+    if together is None:
+        return {}
+    if together.nodes == tuple(nodes):
+        with suppress(ServobusError):
+            return (yield from ask(together))
+    updates: dict[str, Update] = {}
+    for node in nodes if len(nodes) > 1 else ():
+        updates |= yield from _ask_all(block, (node,))
+    return updates
 
 
 def _state_read(servo: HostServo) -> Read[dict[str, Update]]:

@@ -159,6 +159,12 @@ class Write(Acknowledged):
         super().__init__(node, Instruction.WRITE, _payload(address, data), answered=answered and node != BROADCAST_ID)
 
 
+class WriteOnce(Write):
+    """A WRITE that is never repeated as it is, because what was right may be old by then: a goal := present."""
+
+    idempotent = False
+
+
 class RegWrite(Acknowledged):
     """REG WRITE (SMS 1.0, 1.3.4): the servo keeps the write until ACTION."""
 

@@ -12,6 +12,7 @@ from typing import Any
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.model import Register
+from servobus.protocols.sms.identity import learn
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Write
 from servobus.protocols.sms.servo import HostServo
@@ -29,6 +30,8 @@ class SettingWriter:
     def write(self, servo: HostServo, name: str, value: Any, *, raw: bool, persist: bool) -> Plan[Any]:
         """Check everything, then return the plan. Raises LimitError, UnknownName, NotSupported before the first frame."""
         register = servo.model.writable(name)
+        if not raw:
+            register = servo.in_unit(register)
         _refuse(servo, register, persist)
         count = value if raw else servo.to_raw(register, value)
         if raw and (isinstance(value, bool) or not isinstance(value, int)):
@@ -51,6 +54,9 @@ class SettingWriter:
                 )
         if register.name in servo.held:
             servo.hold({register.name: count})
+            servo.own = {**servo.own, register.name: count}
+        if register.name in servo.model.settings_at_start and servo.fit.identified:
+            yield from learn(servo)
         return count if raw else servo.to_physical(register, count)
 
     def _write_eeprom(self, servo: HostServo, register: Register, data: bytes) -> Plan[None]:

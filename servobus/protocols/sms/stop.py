@@ -1,126 +1,163 @@
-"""How a FEETECH line is stopped.
+"""How a FEETECH line is stopped: each servo by the rule of the mode it is in, and confirmed by reading the effect.
 
-The cases:
-1. A servo that must be limp gets torque 0 at once.
-2. An enabled servo in wheel mode gets speed 0 at once.
-3. An enabled servo whose present position is known gets that position as goal at once.
-These leave in SYNC WRITE frames, which have no reply, so each is sent twice. Then the reachable servos are asked one by one, in
-up to three rounds: a limp one must read torque 0; one with torque on gets its present position as goal and acknowledges it.
-Writing a goal switches torque on, so a servo whose torque is off is never written to. Nothing counts as confirmed that was not
-read back or acknowledged.
+| what is stopped | is written | is confirmed when |
+|---|---|---|
+| limp, whatever the mode | torque 0 | torque reads 0 |
+| hold, torque reads 0 | nothing: a hold never energises | at once |
+| hold, position | goal := the present position just read | goal reads so, and the joint is there |
+| hold, velocity | speed 0 | the goal speed reads 0 |
+| hold, pwm or motor | PWM word 0 | the word reads 0 |
+| hold, step | 0 steps to go | two readings of the position are equal; torque 0 where they are not |
+| hold, any other mode, or a servo that is not identified | torque 0 | torque reads 0 |
+
+1. At once, without a question: torque 0 for who goes limp, speed 0 and PWM 0 where these rule, and the estimate of the present
+   position for an enabled servo that is offline. SYNC WRITE frames have no reply, so each is sent twice.
+2. In rounds: each servo that is not confirmed yet is read (mode, torque, goal, position in one turn; one SYNC READ for those that
+   know it), and what its rule asks for is written straight after. A round reads anew, so no old position is ever repeated.
+   A servo that does not answer gets the estimate once; it delays the others by its own turn alone.
+3. What we armed with REG WRITE is disarmed.
+
+A position that does not agree with the estimate is read twice before it is written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from servobus.errors import ServobusError
 from servobus.protocols.base import Plan, Request, ask
 from servobus.protocols.model import Register
+from servobus.protocols.sms.armed import Armed
 from servobus.protocols.sms.goals import max_servos
 from servobus.protocols.sms.options import SmsBus
-from servobus.protocols.sms.requests import SyncWrite, Write
+from servobus.protocols.sms.reading import max_replies
+from servobus.protocols.sms.requests import Read, SyncRead, SyncWrite, Write
 from servobus.protocols.sms.servo import HostServo
+from servobus.protocols.sms.stop_rules import ROUNDS, Registers, Stop, Writes
 from servobus.values import StopReport, StopTarget
 
-ROUNDS = 3
 REPEATS = 2
 """Times an unanswered frame is sent, because a lossy line may lose one."""
-
 Targets = Sequence[tuple[HostServo, StopTarget]]
 
 
-@dataclass(frozen=True, slots=True)
 class Stopper:
     """The plans that stop servos of one bus."""
 
-    options: SmsBus
+    def __init__(self, options: SmsBus, armed: Armed) -> None:
+        self.options = options
+        self._armed = armed
 
     def stop(self, targets: Targets) -> Plan[dict[str, StopReport]]:
         """Return the plan that stops these servos and reports each."""
-        frames, written = self._frames_at_once(targets)
-        for frame in frames:
+        stops = [Stop(servo, target) for servo, target in targets]
+        for frame in self._at_once(stops):
             yield from ask(frame)
-        reports: dict[str, StopReport] = {}
-        for _ in range(ROUNDS):
-            # Each servo is asked once before any is asked again, so one that does not answer delays the others only once.
-            for servo, target in targets:
-                if servo.name not in reports or (target.reachable and not reports[servo.name].confirmed):
-                    reports[servo.name] = yield from self._finish(servo, target, servo.name in written)
-        return reports
+        for number in range(ROUNDS):
+            for group in self._groups([stop for stop in stops if stop.pending]):
+                yield from self._round(group, number)
+        yield from self._armed.disarm_ours([stop.servo.node for stop in stops if stop.target.reachable and not stop.silences])
+        return {stop.servo.name: stop.report for stop in stops}
 
     def preview(self, targets: Targets) -> Sequence[Request[Any]]:
-        """Return the frames that leave before the first reply is awaited, or the first question to each servo."""
-        frames, _ = self._frames_at_once(targets)
-        return frames or [servo.read_raw(servo.model.registers[servo.model.torque]) for servo, _ in targets]
+        """Return the frames that leave at once, the first question to each other servo, and the holds that follow from it."""
+        stops = [Stop(servo, target) for servo, target in targets]
+        at_once = self._at_once(stops)
+        questions = [_question(group, 0) for group in self._groups([stop for stop in stops if not stop.report.written])]
+        holds = [(stop.servo, write) for stop in stops if (write := stop.estimate()) is not None]
+        return [*at_once, *questions, *self._frames(holds)]
+
+    def blind(self, servo: HostServo, target: StopTarget) -> Sequence[Request[Any]]:
+        """Return what stops a servo that does not answer, and may be sent for ever."""
+        write = Stop(servo, target).blind()
+        return [] if write is None else self._frames([(servo, write)])
 
     def disable(self, servo: HostServo) -> Plan[StopReport]:
-        """Return the plan that switches torque off and reads it back."""
-        register = servo.model.registers[servo.model.torque]
-        yield from ask(self._write(servo, register, 0))
-        return (yield from self._limp_report(servo))
+        """Return the plan that switches torque off and reads it back; then the servo gets back what our goals changed."""
+        torque = servo.model.registers[servo.model.torque]
+        yield from ask(self._write(servo, torque, 0))
+        if (yield from ask(servo.read_raw(torque))):
+            return StopReport("limp", True, False, "torque still reads on")
+        with suppress(ServobusError):
+            for name, raw in servo.own.items():
+                if servo.held.get(name) != raw:
+                    yield from ask(self._write(servo, servo.model.registers[name], raw))
+                    servo.hold({name: raw})
+            if servo.node in self._armed and (yield from self._armed.flag(servo.node)):
+                yield from self._armed.disarm(servo)
+        return StopReport("limp", True, True)
 
-    def _frames_at_once(self, targets: Targets) -> tuple[list[SyncWrite], set[str]]:
-        """Return what is written without a question, each frame as often as it is sent, and the names of the servos in it."""
+    # Rounds
+
+    def _groups(self, stops: Sequence[Stop]) -> list[list[Stop]]:
+        """Return who is asked together: those that know SYNC READ and share a block. Who was silent is asked alone, and last."""
+        together: dict[tuple[int, int, int], list[Stop]] = {}
+        for number, stop in enumerate(sorted(stops, key=lambda stop: stop.silences)):
+            alone = 0 if stop.servo.model.sync_read and not stop.silences else number + 1
+            read = stop.servo.read_motion()
+            together.setdefault((read.address, read.reply_key, alone), []).append(stop)
+        groups = []
+        for (_, size, _), members in together.items():
+            count = max_replies(self.options, size)
+            groups += [members[start : start + count] for start in range(0, len(members), count)]
+        return groups
+
+    def _round(self, group: Sequence[Stop], number: int) -> Plan[None]:
+        """Read these servos, and write what their rules ask for."""
+        yield from self._read(group, 0)
+        for more in (1, 2):  # a position that nothing bears out is read again
+            if doubtful := [stop for stop in group if stop.is_doubtful]:
+                yield from self._read(doubtful, more)
+        writes = [(stop.servo, write) for stop in group if (write := stop.next_write(number)) is not None]
+        for frame in self._frames(writes):
+            yield from ask(frame)
+
+    def _read(self, stops: Sequence[Stop], more: int) -> Plan[None]:
+        """Ask these servos, and give each its reading, or what went wrong."""
+        detail = "it did not answer"
+        readings: Mapping[int, Registers] = {}
+        try:
+            readings = yield from ask(_question(stops, more))
+        except ServobusError as error:
+            detail = str(error)
+        for stop in stops:
+            stop.take(readings.get(stop.servo.node), detail)
+
+    # Frames
+
+    def _at_once(self, stops: Sequence[Stop]) -> list[SyncWrite]:
+        """Return what is written without a question, each frame as often as it is sent."""
+        writes = [(stop.servo, write) for stop in stops if (write := stop.at_once()) is not None]
+        return [frame for frame in self._frames(writes) for _ in range(REPEATS)]
+
+    def _frames(self, writes: Sequence[tuple[HostServo, Writes]]) -> list[SyncWrite]:
+        """Return the fewest SYNC WRITE frames that carry these writes."""
         spans: dict[tuple[int, int], dict[int, bytes]] = {}
-        written = set()
-        for servo, target in targets:
-            try:
-                register, raw = _immediate(servo, target)
-                data = servo.encode(register, raw) if register else b""
-            except ServobusError:
-                continue  # the goal register cannot hold this position: the servo is asked for it below
-            if register:
-                spans.setdefault((register.address, register.size), {})[servo.node] = data
-                written.add(servo.name)
-        frames: list[SyncWrite] = []
+        for servo, (register, raw) in writes:
+            spans.setdefault((register.address, register.size), {})[servo.node] = servo.encode(register, raw)
+        frames = []
         for (address, size), data_of in spans.items():
             nodes, count = list(data_of), max_servos(self.options, size)
-            for start in range(0, len(nodes), count):
-                frame = SyncWrite(address, {node: data_of[node] for node in nodes[start : start + count]})
-                frames += [frame] * REPEATS
-        return frames, written
-
-    def _finish(self, servo: HostServo, target: StopTarget, written: bool) -> Plan[StopReport]:
-        """Ask, write what is still missing, and confirm."""
-        if not target.reachable:
-            return StopReport(target.kind, written, False, "offline: nothing was confirmed")
-        try:
-            if target.kind == "limp":
-                return (yield from self._limp_report(servo))
-            return (yield from self._hold(servo, target))
-        except ServobusError as error:
-            return StopReport(target.kind, written, False, str(error))
-
-    def _limp_report(self, servo: HostServo) -> Plan[StopReport]:
-        confirmed = (yield from ask(servo.read_raw(servo.model.registers[servo.model.torque]))) == 0
-        return StopReport("limp", True, confirmed, "" if confirmed else "torque still reads on")
-
-    def _hold(self, servo: HostServo, target: StopTarget) -> Plan[StopReport]:
-        """Goal := present, acknowledged or read back. Never for a servo that is limp."""
-        if not (yield from ask(servo.read_raw(servo.model.registers[servo.model.torque]))):
-            return StopReport("none", False, True, "it was limp" + (": it has restarted" if target.enabled else ""))
-        if servo.fit.mode == "velocity":
-            register, raw = servo.speed, 0
-        else:
-            present = servo.model.registers[servo.model.state["position"]]
-            register, raw = servo.position, (yield from ask(servo.read_raw(present)))
-        yield from ask(self._write(servo, register, raw))
-        confirmed = self.options.writes_answered or (yield from ask(servo.read_raw(register))) == raw
-        return StopReport("hold", True, confirmed, "" if confirmed else f"{register.name} does not read back")
+            parts = [nodes[start : start + count] for start in range(0, len(nodes), count)]
+            frames += [SyncWrite(address, {node: data_of[node] for node in part}) for part in parts]
+        return frames
 
     def _write(self, servo: HostServo, register: Register, raw: int) -> Write:
         return Write(servo.node, register.address, servo.encode(register, raw), answered=self.options.writes_answered)
 
 
-def _immediate(servo: HostServo, target: StopTarget) -> tuple[Register | None, int]:
-    """Return what can be written without a question: a register and its raw value; None: nothing."""
-    if target.kind == "limp":
-        return servo.model.registers[servo.model.torque], 0
-    if target.enabled and servo.fit.mode == "velocity":
-        return servo.speed, 0
-    if target.enabled and target.position is not None:
-        return servo.position, servo.calibration.to_raw(target.position)
-    return None, 0
+def _question(stops: Sequence[Stop], more: int) -> Request[Mapping[int, Registers]]:
+    """Return the read of mode, torque, goal and position of these servos, by node."""
+    reads = {stop.servo.node: stop.servo.read_motion(more=more) for stop in stops}
+    (node, first), *others = reads.items()
+    if not others:
+        decode = first.decode
+        return Read(node, first.address, first.reply_key, lambda data: {node: decode(data)})
+    return SyncRead(
+        first.address,
+        first.reply_key,
+        list(reads),
+        lambda data: {each: reads[each].decode(block) for each, block in data.items()},
+    )

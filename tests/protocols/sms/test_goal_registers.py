@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from servobus.errors import LimitError, NotSupported
-from servobus.protocols.sms.model import SmsModel
 from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench
-from tests.protocols.sms.single_servo import changed, model_of
+from tests.protocols.sms.single_servo import changed
 
 # Position, time and speed
 
@@ -103,10 +102,9 @@ def test_no_flag_and_no_acknowledgement_means_no_confirm() -> None:
     assert bench.sent == []
 
 
-def test_a_model_without_a_wheel_takes_positions_only() -> None:
-    data = model_of("sts").model_dump()
-    bench = Bench(sts=SmsModel.model_validate({**data, "wheel": None}))
-    with pytest.raises(NotSupported, match="takes position goals only"):
+def test_a_model_without_a_mode_for_speeds_takes_positions_only() -> None:
+    bench = Bench({"a": {"id": 1, "model": "scs"}})
+    with pytest.raises(NotSupported, match="model scs takes position goals only"):
         bench.driver.check_goal(ServoGoal("a", Goal("velocity", 1)))
 
 

@@ -75,7 +75,7 @@ def test_notes(keys: dict[str, Any], registers: dict[str, int], message: str) ->
 def test_another_model_than_the_config_says() -> None:
     bench = Bench({"a": {"id": 1, "model": "sms"}})
     bench.devices[1].memory.data[3:5] = b"\x09\x03"
-    assert "the config says sms: check the model" in identity_of(bench).notes[0]
+    assert "the config says sms: set model: sts" in identity_of(bench).notes[0]
 
 
 def test_unexpected_acknowledgements_are_noted() -> None:
@@ -94,10 +94,10 @@ def test_mode_torque_and_limits() -> None:
     assert (identity.mode, identity.energised, identity.limits) == ("velocity", True, (-90.0, 90.0))
 
 
-def test_an_scs_is_a_wheel_without_limits() -> None:
+def test_an_scs_is_a_motor_without_limits() -> None:
     bench = Bench({"a": {"id": 1, "model": "scs"}})
     assert identity_of(bench).mode == "position"
     set_register(bench, "min_angle_limit", 0)
     set_register(bench, "max_angle_limit", 0)
     identity = identity_of(bench)
-    assert (identity.mode, identity.limits) == ("velocity", None)
+    assert (identity.mode, identity.limits) == ("motor", None)

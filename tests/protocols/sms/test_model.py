@@ -35,7 +35,7 @@ def test_the_ranges_of_goals(family: str, ranges: dict[str, tuple[float, float]]
     assert model_of(family).goal_ranges == ranges
 
 
-@pytest.mark.parametrize(("family", "feedback", "health"), [("sts", (56, 11), (56, 15)), ("scs", (56, 11), (56, 11))])
+@pytest.mark.parametrize(("family", "feedback", "health"), [("sts", (40, 27), (40, 31)), ("scs", (40, 27), (40, 27))])
 def test_blocks_are_read_whole(family: str, feedback: tuple[int, int], health: tuple[int, int]) -> None:
     model = model_of(family)
     assert model.block(*model.feedback) == feedback
@@ -56,9 +56,9 @@ def test_the_sentinel_shows_a_restart(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_every_family_can_turn_on_as_a_wheel(family: str) -> None:
-    assert model_of(family).kinds == ("position", "velocity")
-    assert with_keys(wheel=None).kinds == ("position",)
+def test_the_kinds_of_goals_are_those_of_its_modes(family: str) -> None:
+    assert model_of(family).kinds == (("position",) if family == "scs" else ("position", "velocity"))
+    assert with_keys(modes={"velocity": {}}).kinds == ("velocity",)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_every_family_can_turn_on_as_a_wheel(family: str) -> None:
         ({"lock": "padlock"}, "padlock is named as a part"),
         ({"torque": "power"}, "power is named as a part"),
         ({"sentinel": {"name": "x", "value": 1, "reset": 0}}, "x is named as a part"),
-        ({"wheel": {"registers": {"modus": 1}}}, "modus is named as a part"),
+        ({"modes": {"pwm": {"modus": 1}}}, "modus is named as a part"),
         ({"feedback": ("moving", "present_position")}, "moving comes after present_position"),
         ({"health": ("present_current", "present_position")}, "present_current comes after present_position"),
         ({"state": {"speed": "present_speed"}}, "state: position must be there"),

@@ -45,7 +45,7 @@ def test_a_users_model_extends_a_packaged_one(tmp_path: Path) -> None:
         ("extends: sts\nfeedback: [moving, present_position]\n", "moving comes after present_position"),
         ("extends: sts\ngoal: [goal_position]\n", ":2:7: goal: found 1 here; write 3 or more"),
         ("extends: sts\ngoal: [a, b, c, d]\n", ":2:7: goal: found 4 here; write at most 3"),
-        ("extends: sts\nwheel: {registers: {modus: 1}}\n", "modus is named as a part, but the map has no such register"),
+        ("extends: sts\nmodes: {pwm: {modus: 1}}\n", "modus is named as a part, but the map has no such register"),
         ("extends: sts\nstate: 7\n", ":2:8: state: found no keys here; write `{key: value}`"),
         ("extends: [sts]\n", ":1:10: extends: found ['sts']; there are"),
         ("", "found no keys here; there are name, title"),

@@ -202,19 +202,18 @@ def test_names_of_health_bits(model: str, status: int, names: tuple[str, ...]) -
 
 
 @pytest.mark.parametrize(
-    ("model", "order", "middle", "sync_read", "wheel"),
+    ("model", "order", "middle", "sync_read", "modes"),
     [
-        ("sms", "little", 2048, False, {"mode": 1}),
-        ("sts", "little", 2048, True, {"mode": 1}),
-        ("sms_cl", "little", 2048, False, {"mode": 1}),
-        ("scs", "big", 512, False, {"min_angle_limit": 0, "max_angle_limit": 0}),
+        ("sms", "little", 2048, False, ["position", "velocity", "pwm", "step"]),
+        ("sts", "little", 2048, True, ["position", "velocity", "pwm", "step"]),
+        ("sms_cl", "little", 2048, False, ["position", "velocity", "pwm"]),
+        ("scs", "big", 512, False, ["motor", "position"]),
     ],
 )
-def test_differences_between_the_families(model: str, order: str, middle: int, sync_read: bool, wheel: dict[str, int]) -> None:
+def test_differences_between_the_families(model: str, order: str, middle: int, sync_read: bool, modes: list[str]) -> None:
     loaded = packaged_models()[model]
     assert (loaded.byte_order, loaded.zero, loaded.sync_read) == (order, middle, sync_read)
-    assert loaded.wheel is not None
-    assert loaded.wheel.registers == wheel
+    assert list(loaded.modes) == modes
     assert loaded.default_speed == 1000
 
 

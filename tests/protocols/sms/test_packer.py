@@ -13,6 +13,9 @@ from servobus.values import Goal, ServoGoal
 from tests.protocols.sms.bench import Bench
 from tests.protocols.sms.single_servo import changed
 
+COMMANDS = "01 fe 00 08 00 00 e8 03 e8 03 00 00 00 00 00 01 "
+"""The registers 40 to 55 in front of the measured ones."""
+
 
 def enabled() -> Bench:
     bench = Bench()
@@ -73,7 +76,7 @@ def test_a_change_packs_the_goal_again(change: Callable[[Bench, ServoGoal], Serv
 def test_an_equal_report_does_not_count_as_a_change() -> None:
     bench = enabled()
     goal = checked(bench, ServoGoal("a", Goal("position", 10.0)))
-    bench.driver.servos["a"].learn(Fit())
+    bench.driver.servos["a"].learn(replace(bench.driver.servos["a"].fit))
     bench.driver.servos["a"].hold({})
     assert is_reused(bench, goal)
 
@@ -104,5 +107,5 @@ def test_overlapping_state_registers_are_both_decoded() -> None:
     model = changed("sts", load_byte={"address": 60, "size": 1, "access": "r"})
     model = type(model).model_validate({**model.model_dump(), "state": {**model.state, "current": "load_byte"}})
     bench = Bench(sts=model)
-    update = bench.driver.servos["a"].decode_state(bytes.fromhex("00 0c 00 84 f4 05 4a 1e 00 20 01 00 08 64 00"))
+    update = bench.driver.servos["a"].decode_state(bytes.fromhex(COMMANDS + "00 0c 00 84 f4 05 4a 1e 00 20 01 00 08 64 00"))
     assert (update["load"], update["current"], update["position"]) == (-50.0, 0xF4, 90.0)

@@ -9,7 +9,7 @@ import pytest
 from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout, UnknownName
 from servobus.protocols.sms.codec import Instruction
 from servobus.protocols.sms.requests import Read, SyncRead
-from servobus.values import Goal, ServoGoal
+from servobus.values import Goal, Loss, ServoGoal
 from tests.protocols.sms.bench import TWO, Bench
 
 LOCK, DELAY = 55, 7
@@ -89,7 +89,7 @@ def test_a_poll_reads_the_reachable_servos(name: str) -> None:
 def test_a_sync_read_with_long_replies_is_split() -> None:
     servos = {f"s{number}": {"id": number, "model": "sts"} for number in range(1, 13)}
     assert [len(poll.nodes) for poll in Bench(servos).driver.polls({"feedback": 50})] == [12]
-    assert [len(poll.nodes) for poll in Bench(servos, baudrate=115_200).driver.polls({"feedback": 50})] == [6, 6]
+    assert [len(poll.nodes) for poll in Bench(servos, baudrate=115_200).driver.polls({"feedback": 50})] == [3, 3, 3, 3]
     assert [len(poll.nodes) for poll in Bench(servos, baudrate=9600).driver.polls({"feedback": 1})] == [1] * 12
 
 
@@ -167,14 +167,86 @@ def test_registers_that_are_not_written_by_hand(
     assert bench.sent == []
 
 
-def test_an_acceleration_written_by_hand_is_replaced() -> None:
+def test_an_acceleration_written_by_hand_is_the_servos_own() -> None:
     bench = Bench()
     bench.enable()
     bench.run(bench.driver.write_register("a", "acceleration", 1000))
     assert bench.register(1, "acceleration") == 114
-    bench.sent.clear()
+    bench.move({"a": Goal("position", 5, acceleration=500)})
+    assert bench.register(1, "acceleration") == 57
     bench.move({"a": 5})
-    assert bench.sent[0].params[0] == 41, "the goal brings its own again"
+    assert bench.register(1, "acceleration") == 114
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("model", ["sts", "sms", "sms_cl", "scs"])
+def test_stored_limits_keep_their_order_in_the_servos_unit(model: str, direction: int) -> None:
+    """The lower limit of a joint that is mounted the other way round is the servo's upper one."""
+    bench = Bench({"a": {"id": 1, "model": model, "direction": direction, "unit": "step"}})
+    zero = bench.devices[1].model.zero
+    bench.run(bench.driver.write_register("a", "min_angle_limit", -100, persist=True))
+    bench.run(bench.driver.write_register("a", "max_angle_limit", 300, persist=True))
+    ends = (zero - 100, zero + 300) if direction == 1 else (zero - 300, zero + 100)
+    assert (bench.register(1, "min_angle_limit"), bench.register(1, "max_angle_limit")) == ends
+    for name, value in (("min_angle_limit", -100), ("max_angle_limit", 300)):
+        assert bench.ask(bench.driver.read_register("a", name)) == value
+        assert bench.ask(bench.driver.read_register("a", name, raw=True)) == bench.register(1, name)
+    assert bench.run(bench.driver.identify("a")).limits == (-100, 300)
+
+
+# What tells that an enabled servo is not as it was left
+
+
+@pytest.mark.parametrize("model", ["sts", "sms", "sms_cl", "scs"])
+@pytest.mark.parametrize("question", ["feedback", "health", "read", "verify"])
+def test_each_answer_tells_of_a_restart_and_of_lost_torque(model: str, question: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": model}, "b": {"id": 2, "model": model}})
+    bench.enable()
+
+    def losses() -> list[Loss | None]:
+        if question == "verify":
+            losses_of = bench.run(bench.driver.verify(["a", "b"]))
+            return [losses_of.get(name) for name in ("a", "b")]
+        if question == "read":
+            return [bench.ask(bench.driver.read_state(name))[name]["loss"] for name in ("a", "b")]
+        requests = [poll.request([1, 2]) for poll in bench.driver.polls({question: 1})]
+        updates = {name: update for request in requests if request for name, update in bench.ask(request).items()}
+        return [updates[name]["loss"] for name in ("a", "b")]
+
+    assert losses() == [None, None]
+    bench.devices[2].trip(0.0)
+    assert losses() == [None, Loss.TORQUE_OFF]
+    bench.devices[1].restart(0.0)
+    assert losses() == [Loss.RESTARTED, Loss.TORQUE_OFF]
+    assert bench.ask(bench.driver.read_state("a"))["a"]["energised"] is False
+
+
+def test_verify_takes_one_turn_for_those_that_know_sync_read_and_raises_for_nobody() -> None:
+    bench = Bench({**TWO, "c": {"id": 3, "model": "sms"}})
+    bench.enable()
+    assert bench.run(bench.driver.verify(["a", "b", "c"])) == {}
+    assert bench.instructions() == ["SYNC_READ", "READ"]
+    bench.devices[2].dead = bench.devices[3].dead = True
+    bench.devices[1].restart(0.0)
+    assert bench.run(bench.driver.verify(["a", "b", "c"])) == {"a": Loss.RESTARTED}
+    assert bench.run(bench.driver.verify([])) == {}
+
+
+@pytest.mark.parametrize("model", ["sts", "sms", "sms_cl"])
+@pytest.mark.parametrize(("phase", "steps"), [(0, 50), (4, 1), (12, 1), (0x6C, 1), (0x48, 50)])
+def test_the_unit_bit_counts_for_every_speed(model: str, phase: int, steps: int) -> None:
+    """FEETECH memory table, 18: bit 2 chooses 50 steps/s or 1 step/s a count."""
+    bench = Bench({"a": {"id": 1, "model": model, "unit": "step", "direction": -1}})
+    device = bench.devices[1]
+    device.memory.store(device.memory.registers["phase"], phase)
+    bench.enable()
+    bench.move({"a": Goal("position", -500, speed=300)})
+    assert bench.register(1, "goal_speed") == 300 / steps
+    assert bench.ask(bench.driver.read_register("a", "goal_speed")) == -300, "a speed on the way has no direction"
+    update = bench.ask(bench.driver.read_state("a"))["a"]
+    assert update["speed"] == bench.ask(bench.driver.read_register("a", "present_speed")) == -300
+    bench.move({"a": -600})
+    assert bench.register(1, "goal_speed") == 1000 / steps, "the usual speed too"
 
 
 @pytest.mark.parametrize(("register", "value", "raw"), [("min_angle_limit", -90, 1024), ("max_angle_limit", 90, 3072)])

@@ -97,7 +97,8 @@ def test_a_value_the_register_cannot_hold_names_the_servo() -> None:
 
 
 def test_a_block_becomes_fields_of_the_state() -> None:
-    data = bytes.fromhex("00 0c 00 84 f4 05 4a 1e 00 20 01 00 08 64 00")
+    commands = "01 fe 00 08 00 00 e8 03 e8 03 00 00 00 00 00 01"
+    data = bytes.fromhex(commands + "00 0c 00 84 f4 05 4a 1e 00 20 01 00 08 64 00")
     assert servo_of().decode_state(data) == {
         "position": 90.0,
         "speed": -90.0,
@@ -108,14 +109,17 @@ def test_a_block_becomes_fields_of_the_state() -> None:
         "moving": True,
         "goal": 0.0,
         "current": 0.65,
+        "energised": True,
+        "loss": None,
     }
-    feedback = servo_of().decode_feedback(data[:11])
-    assert set(feedback) == {"position", "speed", "load", "voltage", "temperature", "status", "moving"}
+    feedback = servo_of().decode_feedback(data[:27])
+    assert set(feedback) == {"position", "speed", "load", "voltage", "temperature", "status", "moving", "energised", "loss"}
     assert feedback["moving"] is True
 
 
 def test_an_scs_sends_the_high_byte_first() -> None:
-    update = servo_of("scs").decode_feedback(bytes.fromhex("02 01 80 0a 04 64 4a 1e 00 00 00"))
+    commands = "01 00 02 00 00 01 03 e8 01 00 00 00 00 00 00 00"
+    update = servo_of("scs").decode_feedback(bytes.fromhex(commands + "02 01 80 0a 04 64 4a 1e 00 00 00"))
     assert (update["position"], update["speed"]) == pytest.approx((0.21484375, -10 * 0.21484375))
     assert (update["load"], update["moving"]) == (-10.0, False)
 

@@ -1,4 +1,4 @@
-"""How a FEETECH line is stopped: what is sent at once, what is asked, and that a limp servo is never energised."""
+"""How a FEETECH line is stopped: by the rule of the mode each servo is in, confirmed by reading the effect."""
 
 from __future__ import annotations
 
@@ -6,9 +6,21 @@ from typing import Literal
 
 import pytest
 
-from servobus.protocols.sms.codec import Instruction
+from servobus.protocols.sms.codec import Instruction, Packet
+from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.values import Goal, StopReport, StopTarget
 from tests.protocols.sms.bench import TWO, Bench, meddle
+
+FAMILIES = ("sts", "sms", "sms_cl", "scs")
+MODES = [
+    *[(family, mode) for family in ("sts", "sms", "sms_cl") for mode in ("position", "velocity", "pwm")],
+    ("sts", "step"),
+    ("sms", "step"),
+    ("scs", "position"),
+    ("scs", "motor"),
+]
+MODE_NUMBERS = {"position": 0, "velocity": 1, "pwm": 2, "step": 3}
+WRITES = (Instruction.WRITE, Instruction.REG_WRITE, Instruction.SYNC_WRITE)
 
 
 def target(
@@ -27,79 +39,226 @@ def stop(bench: Bench, *targets: StopTarget) -> dict[str, StopReport]:
     return bench.run(bench.driver.stop(targets))
 
 
-def test_positions_are_written_to_all_at_once_and_twice() -> None:
-    bench = Bench()
-    bench.enable()
-    reports = stop(bench, target("a", position=10.0), target("b", position=-10.0))
-    assert bench.instructions()[:2] == ["SYNC_WRITE", "SYNC_WRITE"]
-    assert bench.sent[0].frame == bench.sent[1].frame
-    assert bench.instructions()[2:] == ["READ", "READ", "WRITE"] * 2, "each is asked whether and where it stands, and held there"
-    assert all((report.action, report.written, report.confirmed) == ("hold", True, True) for report in reports.values())
-    assert bench.register(1, "goal_position") == 2048
+def put(device: SmsDevice, name: str, raw: int, now: float = 0.0) -> None:
+    """Somebody else writes a register."""
+    register = device.memory.registers[name]
+    device.memory.store(register, raw)
+    device.apply(register.address, device.memory.read(register.address, register.size), now)
 
 
-def test_a_moving_servo_stands() -> None:
-    bench = Bench()
-    bench.enable()
-    bench.move({"a": 90})
-    bench.now = 0.3
-    stop(bench, target("a"))
-    bench.now = 10.0
-    assert bench.ask(bench.driver.read_state("a"))["a"]["position"] == pytest.approx(0.3 * 1000 * 360 / 4096, abs=0.2)
+def moving(bench: Bench, mode: str, node: int = 1) -> SmsDevice:
+    """Another program has put the servo into a mode, and it moves."""
+    device = bench.devices[node]
+    model = device.model
+    if mode == "motor":
+        put(device, "min_angle_limit", 0)
+        put(device, "max_angle_limit", 0)
+    elif mode in MODE_NUMBERS and "mode" in model.registers:
+        put(device, "mode", MODE_NUMBERS[mode])
+    if mode in ("position", "step"):
+        put(device, "goal_speed", 100)
+        put(device, "goal_position", 900)
+    put(device, model.torque, 1)
+    if mode == "velocity":
+        put(device, "goal_speed", 100)
+    if mode in ("pwm", "motor"):
+        put(device, "goal_time", 100)
+    assert device.joint.velocity != 0
+    return device
 
 
-def test_limp_first_and_confirmed() -> None:
-    bench = Bench()
-    bench.enable()
-    reports = stop(bench, target("a", position=0.0), target("b", "limp"))
-    assert bench.instructions()[:4] == ["SYNC_WRITE"] * 4
-    assert (reports["b"].action, reports["b"].confirmed) == ("limp", True)
-    assert (bench.register(1, "torque_enable"), bench.register(2, "torque_enable")) == (1, 0)
+def travel(bench: Bench, device: SmsDevice, seconds: float = 10.0) -> float:
+    """Return how far the joint goes from now on."""
+    device.joint.advance(bench.now)
+    before = device.joint.position
+    bench.now += seconds
+    device.joint.advance(bench.now)
+    return abs(device.joint.position - before)
 
 
-def test_a_limp_servo_stays_limp() -> None:
-    bench = Bench()
-    reports = stop(bench, target("a", enabled=False, position=5.0), target("b", enabled=False))
-    assert bench.instructions() == ["READ", "READ"]
-    assert all((report.action, report.confirmed) == ("none", True) for report in reports.values())
+# Each mode by its own rule
+
+
+@pytest.mark.parametrize("when", ["identified in this mode", "mode changed since"])
+@pytest.mark.parametrize("kind", ["hold", "limp"])
+@pytest.mark.parametrize(("family", "mode"), MODES)
+def test_a_confirmed_stop_stands_still(family: str, mode: str, kind: Literal["hold", "limp"], when: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    if when == "mode changed since":
+        bench.run(bench.driver.identify("a"))
+    device = moving(bench, mode)
+    if when == "identified in this mode":
+        bench.run(bench.driver.identify("a"))
+    bench.now = 0.5
+    report = stop(bench, target("a", kind, enabled=False))["a"]
+    assert (report.action, report.written, report.confirmed) == (kind, True, True), report
+    assert travel(bench, device) == 0
+    assert bool(bench.register(1, "torque_enable")) is (kind == "hold")
+
+
+@pytest.mark.parametrize(("family", "mode"), MODES)
+def test_what_is_not_read_back_is_not_confirmed(family: str, mode: str) -> None:
+    """Every write is lost, and every one that has a reply is acknowledged by somebody."""
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, mode)
+    bench.run(bench.driver.identify("a"))
+    bench.now = 0.5
+    bench.is_lost = lambda packet: packet.code in WRITES
+    report = stop(bench, target("a", enabled=False))["a"]
+    assert not report.confirmed
+    assert report.detail
+    assert travel(bench, device) > 0
+
+
+@pytest.mark.parametrize(("family", "mode"), MODES)
+def test_a_hold_never_energises(family: str, mode: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, mode)
+    bench.run(bench.driver.identify("a"))
+    put(device, "torque_enable", 0)
+    report = stop(bench, target("a", enabled=False))["a"]
+    assert (report.action, report.confirmed) == ("none", True)
+    assert bench.register(1, "torque_enable") == 0
+    assert travel(bench, device) == 0
+
+
+@pytest.mark.parametrize("family", ["sts", "sms"])
+def test_a_servo_in_step_mode_that_does_not_rest_goes_limp(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, "step")
+    bench.run(bench.driver.identify("a"))
+    goal = device.memory.registers["goal_position"].address
+
+    def ignored(packet: Packet) -> bool:
+        bench.now += 0.05
+        return packet.code == Instruction.SYNC_WRITE and packet.params[0] == goal
+
+    bench.is_lost = ignored
+    report = stop(bench, target("a", enabled=False))["a"]
+    assert (report.action, report.confirmed) == ("limp", True)
+    assert "step mode" in report.detail
+    assert travel(bench, device) == 0
+
+
+@pytest.mark.parametrize("why", ["not identified", "a mode without a name", "another family", "unknown"])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_servo_whose_mode_is_not_known_goes_limp_and_the_report_says_why(family: str, why: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, "position")
+    if why == "a mode without a name":
+        if "mode" not in device.model.registers:
+            pytest.skip("its modes are told apart by its limits")
+        device.memory.data[device.model.registers["mode"].address] = 9
+    elif why == "another family":
+        device.pose_as(*((0, 9, 3) if family != "sts" else (0, 8, 44)))
+    elif why == "unknown":
+        device.pose_as(0, 10, 5)
+    if why != "not identified":
+        bench.run(bench.driver.identify("a"))
+    report = stop(bench, target("a", enabled=False))["a"]
+    assert (report.action, report.confirmed) == ("limp", True)
+    assert "it cannot be held" in report.detail
     assert bench.register(1, "torque_enable") == 0
 
 
-def test_a_servo_energised_by_others_is_held() -> None:
-    bench = Bench()
+# Positions
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_hold_is_what_was_just_read_and_never_an_estimate(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family, "unit": "step"}})
+    bench.enable()
+    bench.move({"a": Goal("position", 300, speed=100)})
+    bench.now = 1.0
+    assert stop(bench, target("a", position=250.0))["a"] == StopReport("hold", True, True)
+    assert bench.register(1, "goal_position") == bench.devices[1].model.zero + 100
+    assert travel(bench, bench.devices[1]) == 0
+
+
+@pytest.mark.parametrize("estimate", [0.0, None])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_one_altered_position_is_not_held(family: str, estimate: float | None) -> None:
+    """Its checksum is right, so only another reading can tell."""
+    bench = Bench({"a": {"id": 1, "model": family}})
+    bench.enable()
     device = bench.devices[1]
-    device.memory.put(device.memory.registers["torque_enable"], 1)
-    assert stop(bench, target("a", enabled=False))["a"] == StopReport("hold", True, True)
+    position, altered = device.joint.position, [900.0]
+
+    def once(packet: Packet) -> bool:
+        device.joint.position = altered.pop() if altered and packet.code != Instruction.SYNC_WRITE else position
+        return False
+
+    bench.is_lost = once
+    report = stop(bench, target("a", position=estimate))["a"]
+    assert report.confirmed
+    assert not altered
+    written = [packet.params for packet in bench.sent if packet.code == Instruction.SYNC_WRITE]
+    register = device.memory.registers["goal_position"]
+    assert {register.decode(params[3:5], device.model.byte_order) for params in written} == {round(position)}
 
 
-def test_a_wheel_stops_turning() -> None:
+def test_a_round_reads_anew_and_repeats_no_old_position() -> None:
     bench = Bench()
-    device = bench.devices[1]
-    device.memory.store(device.memory.registers["mode"], 1)
-    bench.run(bench.driver.identify("a"))
-    bench.enable()
-    bench.move({"a": Goal("velocity", 90)})
-    assert stop(bench, target("a", position=3.0))["a"].confirmed
-    assert bench.register(1, "goal_speed") == 0
+    bench.enable("a")
+    bench.move({"a": Goal("position", 90, speed=90)})
+    lost = [True]
+
+    def slow(packet: Packet) -> bool:
+        bench.now += 0.1
+        return packet.code == Instruction.SYNC_WRITE and bool(lost) and lost.pop()
+
+    bench.is_lost = slow
+    assert stop(bench, target("a"))["a"].confirmed
+    assert travel(bench, bench.devices[1]) < 1
+    frames = [packet.frame for packet in bench.sent if packet.code == Instruction.SYNC_WRITE]
+    assert len(frames) == len(set(frames)) > 1
 
 
-def test_an_offline_servo_is_written_to_without_waiting() -> None:
+def test_sts_are_read_and_held_by_one_frame_each() -> None:
     bench = Bench()
     bench.enable()
-    reports = stop(bench, target("a", position=0.0, reachable=False), target("b", "limp", reachable=False))
-    assert set(bench.instructions()) == {"SYNC_WRITE"}
-    assert reports["a"] == StopReport("hold", True, False, "offline: nothing was confirmed")
-    assert reports["b"].written
+    reports = stop(bench, target("a", position=0.0), target("b", position=0.0))
+    assert bench.instructions() == ["SYNC_READ", "SYNC_WRITE", "SYNC_READ"]
+    assert all(report == StopReport("hold", True, True) for report in reports.values())
 
 
-def test_a_silent_servo_does_not_delay_the_others() -> None:
+@pytest.mark.parametrize("family", ["sms", "sms_cl", "scs"])
+def test_the_others_are_each_held_straight_after_they_are_read(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}, "b": {"id": 2, "model": family}})
+    bench.enable()
+    stop(bench, target("a", position=0.0), target("b", position=0.0))
+    assert bench.instructions() == ["READ", "SYNC_WRITE"] * 2 + ["READ"] * 2
+
+
+def test_torque_off_and_rest_leave_before_any_question() -> None:
+    bench = Bench({**TWO, "c": {"id": 3, "model": "sts"}})
+    moving(bench, "velocity", 2)
+    moving(bench, "pwm", 3)
+    for name in ("b", "c"):
+        bench.run(bench.driver.identify(name))
+    bench.enable("a")
+    stop(bench, target("a", "limp"), target("b"), target("c", enabled=False))
+    assert bench.instructions()[:6] == ["SYNC_WRITE"] * 6
+    assert [packet.params[0] for packet in bench.sent[:6]] == [40, 40, 46, 46, 44, 44]
+    assert bench.instructions()[6:] == ["SYNC_READ"]
+
+
+def test_a_position_outside_the_goal_register_is_not_written() -> None:
     bench = Bench()
     bench.enable()
-    bench.is_lost = lambda packet: packet.id == 1
-    reports = stop(bench, target("a"), target("b"))
-    assert (reports["a"].written, reports["a"].confirmed) == (False, False)
-    assert "no answer" in reports["a"].detail
-    assert reports["b"].confirmed
+    assert stop(bench, target("a", position=1e6))["a"].confirmed
+    assert stop(bench, target("a", position=1e6, reachable=False))["a"].written is False
+
+
+# Limp servos
+
+
+def test_limp_is_confirmed_by_the_torque() -> None:
+    bench = Bench()
+    bench.enable()
+    reports = stop(bench, target("a", position=0.0), target("b", "limp"))
+    assert (reports["b"].action, reports["b"].confirmed) == ("limp", True)
+    assert (bench.register(1, "torque_enable"), bench.register(2, "torque_enable")) == (1, 0)
 
 
 def test_torque_that_stays_on_is_reported() -> None:
@@ -110,49 +269,102 @@ def test_torque_that_stays_on_is_reported() -> None:
     assert stop(bench, target("a", "limp"))["a"] == StopReport("limp", True, False, "torque still reads on")
 
 
-def test_a_restarted_servo_is_not_energised() -> None:
-    bench = Bench()
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("how", ["restarted", "tripped"])
+def test_a_servo_that_lost_its_torque_is_not_energised(family: str, how: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
     bench.enable()
-    bench.devices[1].reboot(0.0)
-    bench.now = 10.0
-    assert stop(bench, target("a"))["a"] == StopReport("none", False, True, "it was limp: it has restarted")
+    device = bench.devices[1]
+    device.restart(0.0) if how == "restarted" else device.trip(0.0)
+    why = "it has restarted" if how == "restarted" else "its torque is off, and not by us"
+    assert stop(bench, target("a"))["a"] == StopReport("none", False, True, f"it was limp: {why}")
     assert bench.register(1, "torque_enable") == 0
 
 
-def test_each_servo_is_asked_before_any_is_asked_again() -> None:
+# Servos that do not answer
+
+
+def test_an_offline_servo_is_written_to_without_waiting() -> None:
     bench = Bench()
     bench.enable()
-    bench.is_lost = lambda packet: packet.id == 1
-    stop(bench, target("a"), target("b"))
-    ids = [packet.id for packet in bench.sent if packet.id != 0xFE]
-    assert ids.index(2) == 1, "the dead one costs the live one a single question"
-    assert ids.count(1) == 3
+    reports = stop(bench, target("a", position=0.0, reachable=False), target("b", "limp", reachable=False))
+    assert bench.instructions() == ["SYNC_WRITE"] * 4
+    assert reports["a"] == StopReport("hold", True, False, "offline: nothing was confirmed")
+    assert reports["b"].written
 
 
-def test_without_acknowledgements_a_hold_is_read_back() -> None:
-    bench = Bench(status_return="read_only")
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_silent_servo_is_held_where_it_is_taken_to_be(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family, "unit": "step"}})
     bench.enable()
-    assert stop(bench, target("a"))["a"] == StopReport("hold", True, True)
-    bench.is_lost = lambda packet: packet.code == Instruction.WRITE
-    bench.devices[1].joint.position = 99.0
-    assert stop(bench, target("a"))["a"] == StopReport("hold", True, False, "goal_position does not read back")
+    bench.move({"a": Goal("position", 300, speed=100)})
+    bench.now = 1.0
+    bench.is_unanswered = lambda packet: True
+    report = stop(bench, target("a", position=101.0))["a"]
+    assert (report.action, report.written, report.confirmed) == ("hold", True, False)
+    assert "no answer" in report.detail
+    assert travel(bench, bench.devices[1]) == 1, "to the estimate"
+    assert bench.instructions() == ["READ", "SYNC_WRITE", "READ", "READ"], "the estimate is never repeated"
 
 
-def test_a_position_outside_the_goal_register_is_read() -> None:
+def test_a_silent_servo_that_was_limp_is_not_written_to() -> None:
     bench = Bench()
+    bench.is_lost = lambda packet: True
+    report = stop(bench, target("a", enabled=False, position=5.0))["a"]
+    assert (report.written, report.confirmed) == (False, False)
+    assert "no answer" in report.detail
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_silent_servo_delays_the_others_by_one_turn(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}, "b": {"id": 2, "model": family}})
     bench.enable()
-    reports = stop(bench, target("a", position=1e6))
-    assert "SYNC_WRITE" not in bench.instructions()
-    assert reports["a"].confirmed
+    bench.devices[1].dead = True
+    reports = stop(bench, target("a"), target("b", position=0.0))
+    assert reports["b"].confirmed
+    assert not reports["a"].confirmed
+    questions = [packet.code in (Instruction.READ, Instruction.SYNC_READ) for packet in bench.sent]
+    asked = [number for number, packet in enumerate(bench.sent) if questions[number] and packet.id == 1]
+    if family == "sts":
+        assert bench.instructions()[:3] == ["SYNC_READ", "SYNC_WRITE", "READ"]
+        assert len(asked) == 2, "alone from then on"
+    else:
+        assert bench.sent[1].id == 2
+        assert len(asked) == 3
+
+
+@pytest.mark.parametrize(("family", "mode"), MODES)
+def test_what_may_be_said_for_ever_is_never_a_position(family: str, mode: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, mode)
+    unknown = bench.driver.blind_stop(target("a", enabled=False))
+    assert [request.frame[5:7] for request in unknown] == [bytes((40, 1))], "torque off, until it is identified"
+    bench.run(bench.driver.identify("a"))
+    limp = bench.driver.blind_stop(target("a", "limp"))
+    assert [request.frame[5] for request in limp] == [40]
+    hold = bench.driver.blind_stop(target("a", position=5.0))
+    address = {"velocity": 46, "pwm": 44, "motor": 44}.get(mode)
+    assert [request.frame[5] for request in hold] == ([] if address is None else [address])
+    for request in (*hold, *hold):
+        bench.ask(request)
+    assert (travel(bench, device) == 0) is bool(hold)
+    device.restart(bench.now)
+    for request in (*hold, *limp):
+        bench.ask(request)
+    assert bench.register(1, "torque_enable") == 0, "a servo that has restarted meanwhile stays limp"
+
+
+# Many, nobody, and previews
 
 
 def test_many_are_split_as_goals_are() -> None:
     bench = Bench({f"s{number}": {"id": number, "model": "sts"} for number in range(1, 81)})
     bench.enable()
-    stop(bench, *(target(name, "limp") for name in bench.driver.nodes))
+    reports = stop(bench, *(target(name, "limp") for name in bench.driver.nodes))
     frames = [packet.frame for packet in bench.sent if packet.code == Instruction.SYNC_WRITE]
     assert len(frames) == 2 * 2
     assert max(map(len, frames)) <= 128
+    assert all(report.confirmed for report in reports.values())
     assert not any(bench.register(number, "torque_enable") for number in range(1, 81))
 
 
@@ -160,11 +372,15 @@ def test_nobody_to_stop() -> None:
     assert stop(Bench(TWO)) == {}
 
 
-def test_a_preview_of_a_stop_ends_at_the_first_reply() -> None:
-    bench = Bench()
-    targets = [target("a", position=10.0), target("b", position=-10.0)]
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_preview_has_the_frames_of_a_stop(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family}})
+    targets = [target("a", position=0.0)]
     frames = [request.frame for request in bench.driver.preview_stop(targets)]
+    limp = [request.frame for request in bench.driver.preview_stop([target("a", "limp")])]
+    assert bench.sent == []
     bench.enable()
     stop(bench, *targets)
-    assert frames == [packet.frame for packet in bench.sent[:2]]
-    assert [request.node for request in bench.driver.preview_stop([target("a"), target("b")])] == [1, 2], "a question to each"
+    assert frames == [packet.frame for packet in bench.sent[: len(frames)]]
+    stop(bench, target("a", "limp"))
+    assert limp == [packet.frame for packet in bench.sent[: len(limp)]]

@@ -1,6 +1,7 @@
 """A simulated joint: its position at any given time. Nothing runs between two calls; `advance` computes what happened since.
 
-It reaches its speed and stops at once (acceleration is not simulated), has no gravity, and warms up with its load.
+It reaches its speed and stops at once (acceleration is not simulated), falls while it is limp if it has a `sag`, and warms up
+with its load.
 """
 
 from __future__ import annotations
@@ -25,13 +26,16 @@ class Joint:
     position: float
     target: float
     rate: float = 0.0
-    """Speed towards the target; signed in wheel mode."""
+    """Speed towards the target; signed where it turns without one."""
     driven: bool = False
     wheel: bool = False
+    """It turns at its rate, without a target."""
     wraps: bool = True
     """It reports 0 again after one turn; False: it counts turns."""
     stuck: bool = False
     """For tests: something blocks it."""
+    sag: float = 0.0
+    """For tests: steps/s at which gravity moves it while it is limp."""
     temperature: float = AMBIENT
     at: float = -math.inf
 
@@ -46,7 +50,7 @@ class Joint:
         load = self.load
         distance = self.velocity * elapsed
         busy = elapsed if load else 0.0
-        if self.wheel:
+        if self.wheel or not self.driven:
             self.position += distance
         elif distance:
             left = self.target - self.position
@@ -64,13 +68,13 @@ class Joint:
     @property
     def load(self) -> float:
         """Return -1 to 1: in proportion to the speed while it moves, full load where it is stuck."""
-        velocity = self._free_velocity
+        velocity = self._free_velocity if self.driven else 0.0
         return math.copysign(1.0, velocity) if self.stuck and velocity else velocity / self.fastest
 
     @property
     def _free_velocity(self) -> float:
         if not self.driven:
-            return 0.0
+            return self.sag
         if self.wheel:
             return self.rate
         left = self.target - self.position

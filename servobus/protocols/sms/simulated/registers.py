@@ -53,6 +53,10 @@ class RegisterTable:
         self.put(register, raw)
         self._stored[register.address : register.end] = self.data[register.address : register.end]
 
+    def identify(self, identity: bytes) -> None:
+        """Report these bytes at addresses 2 to 4, also after a restart."""
+        self.data[2:5] = self._stored[2:5] = identity
+
     def read(self, address: int, size: int) -> bytes:
         """Return these bytes; fewer where the table ends."""
         return bytes(self.data[address : address + size])

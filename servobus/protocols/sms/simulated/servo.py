@@ -4,7 +4,9 @@ Where the documents are silent or contradict each other, the simulated servo beh
 - torque 128 stores the offset that makes the present position 2048, locked or not; goal and torque do not change;
 - a goal outside the stored angle limits ends at the limit, and the goal register keeps the written value;
 - both limits 0 mean many turns: there is no limit, and the position counts on after one turn;
-- modes that are neither position nor wheel (PWM, step), and torque 2 (damping), leave the joint at rest;
+- in step mode a goal is a number of steps to go from where the joint is when the goal is written; turns are counted;
+- under PWM (mode pwm, and motor) the joint turns in proportion to the word, and at full PWM as fast as it can;
+- a mode that the model does not know, and torque 2 (damping), leave the joint at rest;
 - after a restart the goal register is 0 (the table's default), so torque without a new goal moves the joint there;
 - RESET stores the factory values in all EEPROM but the id, needs no unlock, and does not change RAM.
 """
@@ -12,9 +14,11 @@ Where the documents are silent or contradict each other, the simulated servo beh
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
+from servobus.protocols.model import Register
 from servobus.protocols.sms.codec import MAX_ID, MAX_PARAMETERS
-from servobus.protocols.sms.model import SmsModel
+from servobus.protocols.sms.model import LIMITS, SmsModel
 from servobus.protocols.sms.simulated.joint import Joint
 from servobus.protocols.sms.simulated.registers import SIZE, RegisterTable
 
@@ -22,8 +26,11 @@ TORQUE_ON, CALIBRATE = 1, 128
 MIDDLE = 2048
 """The position that the present position becomes after CALIBRATE."""
 AMPERES_AT_FULL_LOAD = 2.0
-SETTINGS = ("torque_limit", "max_torque", "min_angle_limit", "max_angle_limit", "mode", "position_offset")
-"""These registers act on the joint too, beside goal, torque and the wheel registers."""
+PWM_SIGN = 1 << 10
+"""The PWM word is 0 to 1000 (0.1 %), sign in bit 10 (FEETECH memory table, address 44; vendor header SCSCL.h, WritePWM)."""
+OVERLOAD = 1 << 5
+SETTINGS = ("torque_limit", "max_torque", "position_offset")
+"""These registers act on the joint too, beside goal, torque, and what decides about limits, mode and unit."""
 
 
 class SimulatedServo:
@@ -39,6 +46,11 @@ class SimulatedServo:
         self.memory = RegisterTable(model)
         self._registers = self.memory.registers
         self._offset = 0
+        self._mode = ""
+        self._scale = 1.0
+        """Steps/s of a count of speed."""
+        self._end_of_steps = 0.0
+        """Where the last goal in step mode ends."""
         start = float(model.zero if position is None else position) % model.steps_per_turn
         self.joint = Joint(model.steps_per_turn, model.max_steps_per_second, start, start)
         self._live = [(self._registers[name], measure) for name, measure in LIVE.items() if name in self._registers]
@@ -53,14 +65,15 @@ class SimulatedServo:
         for register, measure in self._live:
             if register.address < end and register.end > address:
                 self.joint.advance(now)
-                self.memory.put(register, round(measure(self) / register.scale))
+                scale = self._scale if register.unit == "speed" else register.scale
+                self.memory.put(register, round(measure(self) / scale))
         return self.memory.read(address, min(size, MAX_PARAMETERS))
 
     def apply(self, address: int, data: bytes, now: float) -> None:
         """Carry out a WRITE. Writing the goal position switches torque on."""
         self.joint.advance(now)
         end = min(SIZE, address + len(data))
-        torque, goal = self._registers[self.model.torque], self._registers[self.model.goal[0]]
+        torque, goal, *_ = self._parts
         before = self.memory.get(torque)
         self.memory.write(address, data)
         if self.memory.get(torque) == CALIBRATE:
@@ -68,6 +81,7 @@ class SimulatedServo:
             self._calibrate()
         if address < goal.end and end > goal.address:
             self.memory.put(torque, TORQUE_ON)
+            self._end_of_steps = self.joint.position + self.memory.get(goal)
         if address <= self._registers["baud_rate"].address:
             self._adopt()
         if any(self._steering[address:end]):
@@ -86,6 +100,17 @@ class SimulatedServo:
         self.joint.position %= self.joint.turn
         self.memory.restart()
         self._wake()
+
+    def trip(self, now: float) -> None:
+        """Do what a protection does: torque off, and the fault is reported."""
+        self.joint.advance(now)
+        self.faults |= OVERLOAD
+        self.memory.put(self._parts[0], 0)
+        self._steer()
+
+    def pose_as(self, end: int, major: int, minor: int) -> None:
+        """Report another identity at addresses 2 to 4."""
+        self.memory.identify(bytes((end, major, minor)))
 
     def get(self, name: str) -> int:
         """Return a raw value; 0 where this model has no such register."""
@@ -106,37 +131,57 @@ class SimulatedServo:
 
     # From registers to the joint
 
+    @cached_property
+    def _parts(self) -> tuple[Register, Register, Register, Register]:
+        """The registers of torque, goal, time (or PWM) and speed."""
+        torque, goal, word, speed = (self._registers[name] for name in (self.model.torque, *self.model.goal))
+        return torque, goal, word, speed
+
     def _steer(self) -> None:
         """Make the joint follow the registers."""
-        joint, wheel = self.joint, self._is_wheel()
+        settings = {name: self.get(name) for name in self.model.settings_at_start}
+        joint, mode = self.joint, self.model.mode(settings)
+        self._scale = self.model.speed_scale(settings)
+        if mode != self._mode:  # one that begins has no goal yet
+            self._mode, self._end_of_steps = mode, joint.position
         offset = self.get("position_offset")
         joint.position += self._offset - offset
         self._offset = offset
-        limits = self.get("min_angle_limit"), self.get("max_angle_limit")
-        joint.wheel, joint.wraps = wheel, wheel or limits != (0, 0)
+        joint.wheel = mode in ("velocity", "pwm", "motor")
+        limits = self.get(LIMITS[0]), self.get(LIMITS[1])
+        joint.wraps = joint.wheel or (mode != "step" and limits != (0, 0))
         if joint.wraps:
             joint.position %= joint.turn
-        goal = self.get(self.model.goal[0])
-        joint.target = goal if limits == (0, 0) else max(limits[0], min(limits[1], goal))
-        joint.driven = self.get(self.model.torque) == TORQUE_ON and self._torque_limit() > 0 and (wheel or not self.get("mode"))
-        joint.rate = self._rate(wheel)
+        joint.target = self._target(mode, limits)
+        torque = self.memory.get(self._parts[0])
+        joint.driven = torque == TORQUE_ON and self._torque_limit() > 0 and mode in self.model.modes
+        joint.rate = self._rate(mode)
 
-    def _rate(self, wheel: bool) -> float:
-        """Return steps/s. Speed 0 is rest in wheel mode; else the time register counts, where the model has one, or no limit."""
+    def _target(self, mode: str, limits: tuple[int, int]) -> float:
+        if mode == "step":
+            return self._end_of_steps
+        goal = self.memory.get(self._parts[1])
+        return goal if limits == (0, 0) else max(limits[0], min(limits[1], goal))
+
+    def _rate(self, mode: str) -> float:
+        """Return steps/s. Speed 0 is rest in velocity mode; else the time register counts, where there is one, or no limit."""
         fastest = self.joint.fastest
-        time, speed = (self._registers[name] for name in self.model.goal[1:3])
-        rate = self.memory.get(speed) * speed.scale
-        if wheel:
+        if mode in ("pwm", "motor"):
+            return fastest * max(-1.0, min(1.0, self._pwm() / 1000))
+        rate = self.memory.get(self._parts[3]) * self._scale
+        if mode == "velocity":
             return max(-fastest, min(fastest, rate))
         if rate:
             return min(fastest, abs(rate))
-        milliseconds = self.memory.get(time) if self.model.time_is_ms else 0
+        milliseconds = self.memory.get(self._parts[2]) if self.model.time_is_ms else 0
         distance = abs(self.joint.target - self.joint.position)
         return min(fastest, 1000 * distance / milliseconds) if milliseconds else fastest
 
-    def _is_wheel(self) -> bool:
-        wheel = self.model.wheel
-        return wheel is not None and all(self.get(name) == value for name, value in wheel.registers.items())
+    def _pwm(self) -> int:
+        """Return the PWM word in 0.1 %, with its sign."""
+        register = self._parts[2]
+        word = int.from_bytes(self.memory.read(register.address, register.size), self.model.byte_order)
+        return -(word & PWM_SIGN - 1) if word & PWM_SIGN else word
 
     def _torque_limit(self) -> int:
         """Return the torque limit in 0.1 %."""
@@ -151,8 +196,7 @@ class SimulatedServo:
 
     def _mark_steering(self) -> bytes:
         marks = bytearray(SIZE)
-        wheel = self.model.wheel.registers if self.model.wheel else {}
-        for name in (*self.model.goal, self.model.torque, *SETTINGS, *wheel):
+        for name in (*self.model.goal, self.model.torque, *SETTINGS, *self.model.settings_at_start):
             if register := self._registers.get(name):
                 marks[register.address : register.end] = b"\1" * register.size
         return bytes(marks)

@@ -104,14 +104,78 @@ def test_a_wheel_runs_at_signed_speed() -> None:
     assert (master.read("moving"), master.after(9).read("present_position")) == (0, 4000)
 
 
-def test_scs_is_a_wheel_when_both_limits_are_0() -> None:
-    """The model file decides which mode is which."""
+def test_scs_is_a_motor_when_both_limits_are_0() -> None:
+    """The PWM word at 44 drives it, sign in bit 10 (vendor header SCSCL.h, WritePWM); a speed does not."""
     master = master_of("scs", position=500)
     master.write("min_angle_limit", 0)
     master.write("max_angle_limit", 0)
     master.write("goal_speed", 50)
     master.write(master.model.torque, 1)
-    assert master.after(1).read("present_position") == 500 + round(50 * master.model.registers["goal_speed"].scale)
+    assert master.after(1).read("present_position") == 500
+    master.write("goal_time", 1 << 10 | 100)
+    fastest = master.model.max_steps_per_second
+    assert master.after(1).read("present_position") == (500 - fastest / 10) % 1024
+    master.write("goal_time", 0)
+    assert (master.read("moving"), master.after(9).read("present_position")) == (0, (500 - fastest / 10) % 1024)
+
+
+@pytest.mark.parametrize("family", ["sts", "sms", "sms_cl"])
+def test_pwm_turns_it_until_the_word_is_0(family: str) -> None:
+    master = master_of(family, position=500)
+    master.write("mode", 2)
+    master.write(master.model.torque, 1)
+    master.go(2000)
+    assert master.after(1).read("present_position") == 500, "positions count for nothing"
+    master.write("goal_time", -100)
+    assert master.after(0.1).read("present_position") == round(500 - master.model.max_steps_per_second / 100)
+    master.write("goal_time", 0)
+    assert master.read("moving") == 0
+
+
+@pytest.mark.parametrize("family", ["sts", "sms"])
+def test_a_goal_in_step_mode_is_a_way_from_here(family: str) -> None:
+    master = master_of(family, position=1000)
+    master.write("mode", 3)
+    master.write(master.model.torque, 1)
+    assert master.after(10).read("present_position") == 1000, "a mode that begins has no goal yet"
+    master.go(1500)
+    assert master.after(10).read("present_position") == 2500
+    master.go(-300)
+    assert master.after(10).read("present_position") == 2200
+    master.go(1000, speed=100)
+    master.after(1).write("goal_position", 0)
+    assert (master.read("moving"), master.after(10).read("present_position")) == (0, 2300)
+
+
+@pytest.mark.parametrize("family", ["sts", "sms", "sms_cl"])
+def test_a_bit_of_phase_makes_a_count_of_speed_50_steps(family: str) -> None:
+    """FEETECH memory table, 18: bit 2 chooses 0.732 or 0.0146 rpm."""
+    master = master_of(family, position=1000)
+    master.write("phase", 0)
+    master.go(3000, speed=10)
+    assert master.read("present_speed") == 10
+    assert master.after(1).read("present_position") == 1500
+
+
+def test_a_protection_takes_the_torque_and_gravity_does_the_rest(master: Master) -> None:
+    master.go(700)
+    position = master.after(AT_THE_GOAL).read("present_position")
+    master.device.joint.sag = -10.0
+    assert master.after(1).read("present_position") == position
+    master.device.trip(master.now)
+    reply = master.send(Instruction.PING)
+    assert reply is not None
+    assert (master.read(master.model.torque), reply.code) == (0, 0x20)
+    assert master.after(1).read("present_position") == position - 10
+
+
+def test_it_may_pose_as_another_servo(master: Master) -> None:
+    master.device.pose_as(0, 10, 4)
+    reply = master.send(Instruction.READ, bytes((2, 3)))
+    assert reply is not None
+    assert reply.params == bytes((0, 10, 4))
+    master.device.restart(master.now)
+    assert master.device.memory.read(2, 3) == bytes((0, 10, 4))
 
 
 def test_without_limits_turns_are_counted() -> None:
@@ -127,11 +191,11 @@ def test_without_limits_turns_are_counted() -> None:
     assert master.after(10).read("present_position") == 3996
 
 
-def test_other_modes_rest() -> None:
-    """PWM and step mode are not simulated."""
-    master = master_of("sts", position=1000)
-    master.write("mode", 3)
-    master.go(2000)
+@pytest.mark.parametrize(("family", "mode"), [("sts", 7), ("sms_cl", 3)])
+def test_a_mode_that_the_model_does_not_know_rests(family: str, mode: int) -> None:
+    master = master_of(family, position=1000)
+    master.send(Instruction.WRITE, bytes((master.model.registers["mode"].address, mode)))
+    master.go(700)
     assert master.after(10).read("present_position") == 1000
 
 

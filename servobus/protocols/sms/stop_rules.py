@@ -1,0 +1,213 @@
+"""The stop of one FEETECH servo: what its mode asks for, and what confirms it. `stop` has the table, and asks the servos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from servobus.protocols.model import Register
+from servobus.protocols.sms.identity import UNKNOWN
+from servobus.protocols.sms.servo import HostServo
+from servobus.values import StopReport, StopTarget
+
+ROUNDS = 4
+REST_ROUND = 2
+"""The round in which a servo in step mode that still does not rest goes limp."""
+MAX_SILENCES = 3
+"""Times a servo that does not answer is asked."""
+NEAR = 40
+"""Steps by which a reading may differ from the estimate, and a joint from its goal after a hold (it needs some way to stop)."""
+
+Registers = Mapping[str, int]
+Writes = tuple[Register, int]
+"""A register and its raw value."""
+
+
+class Stop:
+    """The stop of one servo, as far as it has come."""
+
+    __slots__ = ("_before", "_blind", "_goal", "_motion", "_positions", "report", "servo", "silences", "target")
+
+    def __init__(self, servo: HostServo, target: StopTarget) -> None:
+        self.servo = servo
+        self.target = target
+        self.silences = 0
+        self._before: Registers | None = None
+        """What was read in the round before."""
+        self._motion: Registers | None = None
+        """What was read in this round; None: it did not answer."""
+        self._positions: list[int] = []
+        """The positions that were read in this round."""
+        self._goal: int | None = None
+        """The position that was last written as goal."""
+        self._blind = False
+        """The estimate was written already."""
+        detail = "" if target.reachable else "offline: nothing was confirmed"
+        self.report = StopReport(target.kind, False, False, detail)
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is something left to ask."""
+        return self.target.reachable and not self.report.confirmed and self.silences < MAX_SILENCES
+
+    # Without a question
+
+    def at_once(self) -> Writes | None:
+        """Return what is written before anything is asked; None: nothing."""
+        mode, target = self._mode(None), self.target
+        ours = target.kind == "limp" or mode in ("pwm", "motor") or (target.enabled and mode == "velocity")
+        write = self.blind() if ours or not target.reachable else None
+        if write is None and not target.reachable:
+            write = self.estimate()
+        return self._written(write)
+
+    def blind(self) -> Writes | None:
+        """Return what may be written for ever to a servo that does not answer: never a position."""
+        if self.target.kind == "limp":
+            return self._torque_off
+        return self._rest_of(self._mode(None))
+
+    def estimate(self) -> Writes | None:
+        """Return the estimate of the present position as a goal, once, for a servo that was energised when it was last heard."""
+        target, servo = self.target, self.servo
+        if self._blind or not target.enabled or target.position is None or servo.fit.mode != "position":
+            return None
+        raw = servo.calibration.to_raw(target.position)
+        low, high = servo.position.raw_range
+        if not low <= raw <= high:
+            return None
+        self._blind = True
+        return servo.position, raw
+
+    # What was read
+
+    def take(self, motion: Registers | None, detail: str) -> None:
+        """Take a reading of this round; None: there was none, for this reason."""
+        if motion is None:
+            self.silences += 1
+            self._motion = None
+            self._report(self.report.action, confirmed=False, detail=detail)
+            return
+        self.silences = 0
+        self._motion = motion
+        self._positions.append(motion[self.servo.model.state["position"]])
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a position is needed, and neither the estimate nor another reading bears out what was read."""
+        if self._motion is None or not self._holds_position(self._motion):
+            return False
+        last, *others = reversed(self._positions)
+        estimate = self.target.position
+        witnesses = others if estimate is None else [*others, self.servo.calibration.to_raw(estimate)]
+        witnesses += [] if self._goal is None else [self._goal]
+        return not any(abs(last - witness) <= NEAR for witness in witnesses)
+
+    def next_write(self, number: int) -> Writes | None:
+        """Return what this round writes after it has read; None: nothing. The report says what is confirmed."""
+        motion, positions = self._motion, self._positions
+        self._motion, self._positions = None, []
+        if motion is None:
+            return self._written(self.estimate())
+        before, self._before = self._before, motion
+        return self._written(self._rule(motion, before, positions, number))
+
+    def _rule(self, motion: Registers, before: Registers | None, positions: list[int], number: int) -> Writes | None:
+        if self.target.kind == "limp" or self.report.action == "limp":
+            return self._limp(motion, "torque still reads on")
+        if not motion[self.servo.model.torque]:
+            return self._report("none", confirmed=True, detail=self._why_limp(motion))
+        mode = self._mode(motion)
+        if mode == "position":
+            return self._hold(motion, positions)
+        if mode == "step":
+            return self._end_steps(motion, before, number)
+        write = self._rest_of(mode)
+        if write == self._torque_off:
+            return self._limp(motion, self._why_not_held(mode))
+        if write is None or motion[write[0].name] == write[1]:
+            return self._report("hold", confirmed=True)
+        self._report("hold", confirmed=False, detail=f"{write[0].name} does not read {write[1]}")
+        return write
+
+    # The rules
+
+    def _limp(self, motion: Registers, detail: str) -> Writes | None:
+        """Torque 0 for as long as it is on."""
+        if not motion[self.servo.model.torque]:
+            return self._report("limp", confirmed=True, detail="" if self.target.kind == "limp" else self.report.detail)
+        self._report("limp", confirmed=False, detail=detail)
+        return self._torque_off
+
+    def _hold(self, motion: Registers, positions: list[int]) -> Writes | None:
+        """Goal := present, until the goal reads so and the joint is there."""
+        register, present = self.servo.position, motion[self.servo.model.state["position"]]
+        if self._goal is not None and motion[register.name] == self._goal and abs(present - self._goal) <= NEAR:
+            return self._report("hold", confirmed=True)
+        detail = "" if self._goal is None else f"{register.name} does not read back, or the joint is not there"
+        self._report("hold", confirmed=False, detail=detail)
+        low, high = register.raw_range
+        self._goal = max(low, min(high, sorted(positions)[1] if len(positions) > 2 else present))
+        return register, self._goal
+
+    def _end_steps(self, motion: Registers, before: Registers | None, number: int) -> Writes | None:
+        """0 steps to go; torque 0 where it does not rest all the same."""
+        state = self.servo.model.state
+        position, moving = state["position"], state.get("moving", "")
+        if before is not None and before[position] == motion[position] and not motion.get(moving, 0):
+            return self._report("hold", confirmed=True)
+        if number < REST_ROUND:
+            self._report("hold", confirmed=False, detail="it does not rest")
+            return (self.servo.position, 0) if before is None else None
+        return self._limp(motion, "it did not rest in step mode: torque was switched off")
+
+    # Parts
+
+    @property
+    def _torque_off(self) -> Writes:
+        return self.servo.model.registers[self.servo.model.torque], 0
+
+    def _mode(self, motion: Registers | None) -> str:
+        """Return the mode that was just read, or the one that was identified."""
+        fit = self.servo.fit
+        if not fit.identified or fit.mode == UNKNOWN:
+            return UNKNOWN
+        return fit.mode if motion is None else self.servo.model.mode(motion)
+
+    def _holds_position(self, motion: Registers) -> bool:
+        return self.target.kind == "hold" and motion[self.servo.model.torque] != 0 and self._mode(motion) == "position"
+
+    def _rest_of(self, mode: str) -> Writes | None:
+        """Return the write that ends motion in this mode without a position; None: there is none."""
+        match mode:
+            case "position" | "step":
+                return None
+            case "velocity":
+                return self.servo.speed, 0
+            case "pwm" | "motor":
+                return self.servo.time, 0
+            case _:
+                return self._torque_off
+
+    def _why_limp(self, motion: Registers) -> str:
+        if not self.target.enabled:
+            return "it was limp"
+        sentinel = self.servo.model.sentinel
+        cause = "it has restarted" if motion[sentinel.name] == sentinel.reset else "its torque is off, and not by us"
+        return f"it was limp: {cause}"
+
+    def _why_not_held(self, mode: str) -> str:
+        fit = self.servo.fit
+        reason = fit.obstacle or (
+            "it was not identified" if mode == UNKNOWN else f"it is in {mode}, which its model does not know"
+        )
+        return f"its torque was switched off, because it cannot be held: {reason}"
+
+    def _written(self, write: Writes | None) -> Writes | None:
+        if write is not None and not self.report.written:
+            self.report = StopReport(self.report.action, True, self.report.confirmed, self.report.detail)
+        return write
+
+    def _report(self, action: str, *, confirmed: bool, detail: str = "") -> Writes | None:
+        """Keep the report. What is not confirmed says why; nothing follows from it by itself."""
+        self.report = StopReport(action, self.report.written and action != "none", confirmed, detail)
+        return None
