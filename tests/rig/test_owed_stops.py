@@ -17,6 +17,7 @@ from servobus.values import Health
 from tests.simulated_rigs import config, devices
 from tests.virtual_time import virtual
 from tests.waiting import until
+from tests.wire_log import WireLog
 
 PROTOCOLS = {
     "sts": "protocol: sms, baudrate: 1000000, servos: {{s1: {{id: 1, model: sts, speed: 20{keys}}}, s2: {{id: 2, model: sts}}}}",
@@ -138,3 +139,17 @@ async def test_the_exit_waits_for_a_servo_that_is_heard_again_in_time() -> None:
         asyncio.get_running_loop().call_later(0.4, setattr, servo, "dead", False)
     assert rig.left["arm/s1"].confirmed
     assert servo.get("torque_enable") == 0
+
+
+@virtual
+async def test_a_limp_stop_is_told_again_with_each_probe() -> None:
+    log = WireLog()
+    async with open_rig(config("s1: {id: 1, model: sts, on_estop: limp}", "s2: {id: 2, model: sts}"), trace=log) as rig:
+        await rig.enable()
+        devices(rig)[1].dead = True
+        await rig.stop()
+        await until(lambda: rig.state("s1").health is Health.OFFLINE)
+        del log.sent_frames[:]
+        await asyncio.sleep(2.0)
+        blind = [frame for frame in log.sent_frames if frame[4] == 0x83 or (frame[4] == 3 and frame[5] == 40)]
+        assert len(blind) >= 4, "torque off is sent with every probe, and the probes stay frequent"
