@@ -7,19 +7,10 @@ from typing import Literal
 import pytest
 
 from servobus.protocols.sms.codec import Instruction, Packet
-from servobus.protocols.sms.simulated.device import SmsDevice
 from servobus.values import Goal, StopReport, StopTarget
 from tests.protocols.sms.bench import TWO, Bench, meddle
+from tests.protocols.sms.states import FAMILIES, MODES, moving, put, travel
 
-FAMILIES = ("sts", "sms", "sms_cl", "scs")
-MODES = [
-    *[(family, mode) for family in ("sts", "sms", "sms_cl") for mode in ("position", "velocity", "pwm")],
-    ("sts", "step"),
-    ("sms", "step"),
-    ("scs", "position"),
-    ("scs", "motor"),
-]
-MODE_NUMBERS = {"position": 0, "velocity": 1, "pwm": 2, "step": 3}
 WRITES = (Instruction.WRITE, Instruction.REG_WRITE, Instruction.SYNC_WRITE)
 
 
@@ -37,43 +28,6 @@ def target(
 def stop(bench: Bench, *targets: StopTarget) -> dict[str, StopReport]:
     bench.sent.clear()
     return bench.run(bench.driver.stop(targets))
-
-
-def put(device: SmsDevice, name: str, raw: int, now: float = 0.0) -> None:
-    """Somebody else writes a register."""
-    register = device.memory.registers[name]
-    device.memory.store(register, raw)
-    device.apply(register.address, device.memory.read(register.address, register.size), now)
-
-
-def moving(bench: Bench, mode: str, node: int = 1) -> SmsDevice:
-    """Another program has put the servo into a mode, and it moves."""
-    device = bench.devices[node]
-    model = device.model
-    if mode == "motor":
-        put(device, "min_angle_limit", 0)
-        put(device, "max_angle_limit", 0)
-    elif mode in MODE_NUMBERS and "mode" in model.registers:
-        put(device, "mode", MODE_NUMBERS[mode])
-    if mode in ("position", "step"):
-        put(device, "goal_speed", 100)
-        put(device, "goal_position", 900)
-    put(device, model.torque, 1)
-    if mode == "velocity":
-        put(device, "goal_speed", 100)
-    if mode in ("pwm", "motor"):
-        put(device, "goal_time", 100)
-    assert device.joint.velocity != 0
-    return device
-
-
-def travel(bench: Bench, device: SmsDevice, seconds: float = 10.0) -> float:
-    """Return how far the joint goes from now on."""
-    device.joint.advance(bench.now)
-    before = device.joint.position
-    bench.now += seconds
-    device.joint.advance(bench.now)
-    return abs(device.joint.position - before)
 
 
 # Each mode by its own rule
