@@ -7,8 +7,10 @@ import logging
 import sys
 from collections.abc import Callable
 
-from tests.campaigns import crowd, daemon, days, dead_servo, faults, slow_hand
+from tests.campaigns import crowd, daemon, days, dead_servo, faults, safety, slow_hand
 from tests.campaigns.oracle import ORACLES
+
+WHOLE = 1_000_000
 
 
 def soak_faults(count: int) -> bool:
@@ -59,6 +61,10 @@ def soak_daemon(_: int) -> bool:
     return result.kept()
 
 
+def soak_safety(count: int) -> bool:
+    return safety.safety(count / WHOLE)
+
+
 def soak_days(hours: float) -> bool:
     result = days.days(hours)
     result.report()
@@ -72,6 +78,7 @@ CAMPAIGNS: dict[str, Callable[[int], bool]] = {
     "line": soak_line,
     "kill": soak_kill,
     "daemon": soak_daemon,
+    "safety": soak_safety,
 }
 NAMES = (*CAMPAIGNS, "days")
 
@@ -80,7 +87,7 @@ def main() -> int:
     """Status 1 when a figure misses what it has to reach."""
     parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__)
     parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=f"{', '.join(NAMES)}; all if none is named")
-    parser.add_argument("--count", type=int, default=1_000_000, help="reads of the faults campaign, ten times the cancels")
+    parser.add_argument("--count", type=int, default=WHOLE, help="reads of the faults campaign; the others scale with it")
     parser.add_argument("--hours", type=float, default=1.5, help="virtual hours of the days campaign")
     arguments = parser.parse_args()
     if unknown := set(arguments.campaigns) - set(NAMES):

@@ -1,0 +1,17 @@
+"""Each row of `scripts/soak safety` once: a rule about joints, with each protocol, model and mode that it applies to."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.campaigns import safety
+from tests.campaigns.bench import Case
+from tests.campaigns.safety import RULES, Rule
+
+ROWS = [pytest.param(rule, case, id=f"{rule.name}: {case}") for rule in RULES for case in rule.cases]
+
+
+@pytest.mark.parametrize(("rule", "case"), ROWS)
+def test_nothing_moves_by_surprise(rule: Rule, case: Case) -> None:
+    figures = safety.run(rule, case, 2)
+    assert figures.kept(), figures
