@@ -1,4 +1,4 @@
-"""A REG WRITE that nobody fired moves nobody later: ACTION waits until its servo was read as not armed (SMS 1.0, 1.3.4, 1.3.5)."""
+"""A REG WRITE that nobody fired moves nobody later: ACTION waits until its servo reads as not armed (SMS 1.0, 1.3.4, 1.3.5)."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def test_a_goal_that_got_lost_is_never_repeated_on_a_sagging_arm(family: str) ->
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("number", range(20))
-def test_a_lost_answer_ends_enabled_at_its_place_or_limp(family: str, number: int) -> None:
+def test_a_lost_answer_ends_enabled_where_it_stood_or_limp(family: str, number: int) -> None:
     bench = bench_of(family)
     device = bench.devices[1]
     count = [0]
