@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Callable
 
-from tests.campaigns import crowd, daemon, days, dead_servo, faults, safety, slow_hand
+from tests.campaigns import crowd, daemon, days, dead_servo, estop, faults, safety, slow_hand
 from tests.campaigns.oracle import ORACLES
 
 WHOLE = 1_000_000
@@ -65,6 +65,13 @@ def soak_safety(count: int) -> bool:
     return safety.safety(count / WHOLE)
 
 
+def soak_estop(count: int) -> bool:
+    latencies = [estop.estop(setting, max(1, 200 * count // WHOLE)) for setting in estop.SETTINGS]
+    for latency in latencies:
+        latency.report()
+    return not any(latency.unconfirmed for latency in latencies)
+
+
 def soak_days(hours: float) -> bool:
     result = days.days(hours)
     result.report()
@@ -79,6 +86,7 @@ CAMPAIGNS: dict[str, Callable[[int], bool]] = {
     "kill": soak_kill,
     "daemon": soak_daemon,
     "safety": soak_safety,
+    "estop": soak_estop,
 }
 NAMES = (*CAMPAIGNS, "days")
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from tests.campaigns import days, dead_servo, faults, slow_hand
+from tests.campaigns import days, dead_servo, estop, faults, slow_hand
 from tests.campaigns.faults import KINDS, Result
 from tests.campaigns.oracle import ORACLES
 
@@ -71,3 +71,11 @@ def test_half_a_minute_of_the_days() -> None:
     assert result.drift < days.MAX_DRIFT
     assert result.counts["timeouts"] > 50, "the line was as bad as it should be"
     assert result.outcomes["sent"] > 4000
+
+
+@pytest.mark.parametrize("setting", estop.SETTINGS, ids=lambda setting: setting.name)
+def test_estops_are_confirmed(setting: estop.Setting) -> None:
+    latency = estop.estop(setting, 3)
+    assert latency.unconfirmed == 0
+    assert len(latency.frames) == 3
+    assert all(0 < frame <= answer for frame, answer in zip(latency.frames, latency.answers, strict=True))

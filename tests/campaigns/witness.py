@@ -13,11 +13,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from heapq import heappop, heappush
 from urllib.parse import SplitResult
 
 from servobus.links import SCHEMES
 from servobus.links.memory import MemoryLink
 from servobus.protocols.base import LineTraits
+from servobus.timers import FineTimer, clock_of
 
 NEVER = -1.0
 REPLY_DELAY = 0.0002
@@ -113,7 +116,13 @@ class WitnessLine(ABC):
         self.rng = rng
         self.alter: Callable[[int, bytes], bytes] = lambda node, reply: reply
         """What becomes of a reply on the way."""
-        self._loop = asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
+        self.clock = clock_of(loop)
+        self.dead = False
+        """Nothing reaches anybody on this line, and it takes its bytes all the same."""
+        self._timer = FineTimer(loop, self._on_time)
+        self._due: list[tuple[float, int, Callable[[], object]]] = []
+        self._count = 0
         self._byte_time = 10.0 / baudrate
         self._free = 0.0
         self._buffer = b""
@@ -126,16 +135,31 @@ class WitnessLine(ABC):
         self._byte_time = 10.0 / baudrate
 
     def receive(self, data: bytes) -> None:
-        self._free = max(self._loop.time(), self._free) + len(data) * self._byte_time
+        self._free = max(self.clock(), self._free) + len(data) * self._byte_time
         self._buffer += data
         while frame := self._next_frame():
             self.log.append(Sent(self._free, frame))
-            self._loop.call_at(self._free, self._handle, frame, self._free)
+            if not self.dead:
+                self._later(self._free, partial(self._handle, frame, self._free))
 
     def settle(self) -> None:
         """Let every joint move until now."""
         for servo in self.servos.values():
-            servo.advance(self._loop.time())
+            servo.advance(self.clock())
+
+    def close(self) -> None:
+        self._timer.close()
+
+    def _later(self, when: float, call: Callable[[], object]) -> None:
+        self._count += 1
+        heappush(self._due, (when, self._count, call))
+        self._timer.arm(self._due[0][0])
+
+    def _on_time(self) -> None:
+        while self._due and self._due[0][0] <= self.clock():
+            heappop(self._due)[2]()
+        if self._due:
+            self._timer.arm(self._due[0][0])
 
     def _next_frame(self) -> bytes:
         while self._buffer:
@@ -154,7 +178,7 @@ class WitnessLine(ABC):
             altered = self.alter(node, reply)
             if altered:
                 due += REPLY_DELAY + len(altered) * self._byte_time
-                self._loop.call_at(due, self._deliver, altered)
+                self._later(due, partial(self._deliver, altered))
 
     @abstractmethod
     def size_of(self, data: bytes) -> int:
