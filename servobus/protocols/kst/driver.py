@@ -158,7 +158,7 @@ class KstDriver(Driver):
         return goals.enable(self.settings, self.servos[servo])
 
     def disable(self, servo: str) -> Plan[StopReport]:
-        return goals.disable(self.servos[servo])
+        return goals.disable(self.settings, self.servos[servo])
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
         return goals.stop(self.settings, [(self.servos[target.servo], target) for target in targets])

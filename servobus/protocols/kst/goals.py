@@ -188,8 +188,7 @@ def _with_note(report: StopReport, target: StopTarget) -> StopReport:
     return replace(report, detail=HOLDS) if target.kind == "limp" and report.confirmed and not report.detail else report
 
 
-def disable(servo: CalibratedServo) -> Plan[StopReport]:
-    """Send nothing: the servo keeps holding, and goals are refused from now on."""
-    yield from ()
-    servo.travel.end()
-    return StopReport("hold", False, True, HOLDS)
+def disable(settings: RequestSettings, servo: CalibratedServo) -> Plan[StopReport]:
+    """Hold the servo. One that was not enabled is sent nothing."""
+    target = StopTarget(servo.name, "limp", enabled=servo.travel.range is not None)
+    return (yield from stop(settings, [(servo, target)]))[servo.name]

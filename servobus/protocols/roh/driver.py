@@ -242,7 +242,8 @@ class RohDriver(Driver):
         return lost
 
     def disable(self, servo: str) -> Plan[StopReport]:
-        return stop.disable()
+        finger, hand = self._of(servo)
+        return stop.disable(hand, finger)
 
     def stop(self, targets: Sequence[StopTarget]) -> Plan[dict[str, StopReport]]:
         return stop.stop(self.hands, [(self.fingers[target.servo], target) for target in targets])

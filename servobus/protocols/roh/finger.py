@@ -17,8 +17,9 @@ from servobus.values import Loss, ServoGoal, Update, is_number
 
 BY_UNIT = {"%": ("pos_target", "pos"), "deg": ("angle_target", "angle")}
 """Unit of a finger -> registers of its target and of its position."""
-ROUNDING = {"%": 0, "deg": 100}
-"""Steps by which a target may read back differently from what was written: the hand turns angles into positions."""
+ROUNDING = {"%": 0, "deg": FULL}
+"""Steps by which a target may read back differently from what was written. The hand turns angles into positions, and replaces an
+angle outside its own range by its limit: an angle shows no restart."""
 MIN_STEP = 0.1
 """A finger arrives within about ten of these (% or degrees), however fine its registers are."""
 MAX_SPEED = FULL - 1
@@ -98,10 +99,14 @@ class Finger:
         for name, raw in ((self.target_name, target), ("speed", speed), ("current_limit", current_limit)):
             self.held.confirm(name, raw)
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether it was enabled, and has neither restarted since nor been disabled."""
+        return bool(self.held.targets)
+
     def is_kept(self, name: str, raw: int) -> bool:
         """Return whether this reading shows the register as it was left; False: the hand has restarted."""
-        has_begun = bool(self.held.targets)
-        return self.held.matches(name, raw) and not (has_begun and name == "speed" and raw > MAX_SPEED)
+        return self.held.matches(name, raw) and not (self.is_begun and name == "speed" and raw > MAX_SPEED)
 
     def near(self, raw: int, other: int, steps: float = 10.0) -> bool:
         """Return whether two positions or targets are within so many of the finger's steps, which are not those of its
@@ -137,7 +142,7 @@ class Finger:
 
     def _loss(self, model: RohModel, span: Span, registers: Sequence[int]) -> Update:
         """Return what these registers tell about a restart: all of it only where the speed is among them."""
-        if not self.held.targets:
+        if not self.is_begun:
             return {}
         kept = {}
         for name in ("speed", self.target_name):

@@ -53,15 +53,17 @@ def stop(hands: Mapping[int, Hand], targets: Sequence[tuple[Finger, StopTarget]]
         yield from _write_unanswered(hand, silent, written)
     for unit, hand in hands.items():
         held = [finger for finger in written if finger.node == unit and finger not in failed]
-        reports |= yield from _confirm(hand, held)
+        reports |= yield from _confirm(hand, held, written)
     reports |= {finger.name: StopReport("hold", finger in written, False, error.message) for finger, error in failed.items()}
     return {finger.name: _with_note(reports[finger.name], target) for finger, target in targets}
 
 
-def disable() -> Plan[StopReport]:
-    """Send nothing: the finger keeps holding, and goals are refused from now on."""
-    yield from ()
-    return StopReport("hold", False, True, HOLDS)
+def disable(hand: Hand, finger: Finger) -> Plan[StopReport]:
+    """Hold the finger. One that was not enabled is sent nothing."""
+    target = StopTarget(finger.name, "limp", enabled=finger.is_begun)
+    reports = yield from stop({hand.unit: hand}, [(finger, target)])
+    finger.held.targets.clear()
+    return reports[finger.name]
 
 
 def _hold(hand: Hand, targets: Targets, written: Written) -> Plan[Failures]:
@@ -77,7 +79,7 @@ def _hold(hand: Hand, targets: Targets, written: Written) -> Plan[Failures]:
     return failed
 
 
-def _confirm(hand: Hand, fingers: Sequence[Finger]) -> Plan[dict[str, StopReport]]:
+def _confirm(hand: Hand, fingers: Sequence[Finger], written: Written) -> Plan[dict[str, StopReport]]:
     if not fingers:
         return {}
     try:
@@ -85,13 +87,13 @@ def _confirm(hand: Hand, fingers: Sequence[Finger]) -> Plan[dict[str, StopReport
     except ServobusError as error:
         detail = f"its target was written, and not read back: {error.message}"
         return {finger.name: StopReport("hold", True, False, detail) for finger in fingers}
-    return {finger.name: _report(finger, *readings[finger]) for finger in fingers}
+    return {finger.name: _report(finger, written[finger], *readings[finger]) for finger in fingers}
 
 
-def _report(finger: Finger, before: Reading, now: Reading) -> StopReport:
+def _report(finger: Finger, target: int, before: Reading, now: Reading) -> StopReport:
     detail = ""
-    if not finger.is_kept(finger.target_name, now.target):
-        detail = f"its target reads {_text(finger, now.target)} after another was written"
+    if not finger.near(target, now.target):
+        detail = f"its target reads {_text(finger, now.target)} after {_text(finger, target)} was written"
     elif not rests(finger, before, now):
         detail = f"it still moves: it was read at {_text(finger, before.position)}, then at {_text(finger, now.position)}"
     return StopReport("hold", True, not detail, detail)

@@ -366,10 +366,15 @@ def test_a_latched_fault_does_not_keep_a_stop_back() -> None:
     assert bench.run(bench.driver.stop([target("pan")]))["pan"].confirmed
 
 
-def test_disable_closes_the_gate_and_says_nothing() -> None:
-    """KST RS422, 3, has no torque, stop or speed command."""
-    bench = enabled()
-    assert bench.run(bench.driver.disable("pan")) == StopReport("hold", False, True, HOLDS)
+def test_disable_holds_the_servo_and_closes_the_gate() -> None:
+    """KST RS422, 3, has no torque command."""
+    bench = enabled(model=changed_model(max_steps_per_second=200.0))
+    move(bench, pan=80)
+    bench.after(0.5).frames()
+    assert bench.run(bench.driver.disable("pan")) == StopReport("hold", True, True, HOLDS)
+    assert bench.after(1).devices[0].goal == 105
+    bench.frames()
+    assert bench.run(bench.driver.disable("pan")).action == "none"
     assert bench.frames() == []
 
 

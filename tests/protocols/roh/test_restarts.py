@@ -12,7 +12,7 @@ from servobus.errors import DeviceError, ReplyTimeout, ServobusError
 from servobus.protocols.roh.model import packaged_models
 from servobus.protocols.roh.simulated.device import RohDevice
 from servobus.values import Goal, Health, Loss
-from tests.protocols.roh.bench import Bench, bench_of, goal
+from tests.protocols.roh.bench import HAND, Bench, bench_of, goal
 from tests.protocols.roh.test_bus import TWO, running
 from tests.virtual_time import virtual
 
@@ -155,6 +155,17 @@ def verify(bench: Bench, *servos: str) -> dict[str, Loss]:
     plan = bench.driver.verify(servos)
     assert plan is not None
     return dict(bench.run(plan))
+
+
+def test_an_angle_that_the_hand_replaced_by_its_own_limit_is_no_restart() -> None:
+    """Angle ranges differ from hand to hand; a target outside is silently replaced (the vendor's FAQ)."""
+    bench = Bench({"index": {**HAND["index"], "unit": "deg"}}).enable()
+    bench.move(goal("index", 102))
+    bench.hand.poke("angle_target", 1, 10800)
+    assert verify(bench, "index") == {}
+    assert bench.run(bench.driver.fence(2, [], ["index"]))
+    bench.hand.reboot(bench.now)
+    assert verify(bench.after(5), "index") == {"index": Loss.RESTARTED}
 
 
 # Enable

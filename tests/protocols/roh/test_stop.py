@@ -78,7 +78,7 @@ def test_a_stop_is_confirmed_only_when_the_finger_rests() -> None:
     bench.after(1).hand.ignores_targets = True
     reports = bench.run(bench.driver.stop([target("index"), target("ring")]))
     assert (reports["index"].written, reports["index"].confirmed, reports["ring"].confirmed) == (True, False, True)
-    assert "its target reads 100 after another was written" in reports["index"].detail
+    assert "its target reads 100 after 20 was written" in reports["index"].detail
     bench.hand.ignores_targets = False
     assert bench.run(bench.driver.stop([target("index")]))["index"].confirmed
 
@@ -128,3 +128,16 @@ def test_a_hand_that_has_restarted_is_sent_nowhere(self_test: int) -> None:
     stood = bench.after(10).hand.fingers[1].position
     bench.run(bench.driver.stop([target("index", position=60.0)]))
     assert bench.after(5).hand.fingers[1].position == stood
+
+
+def test_disable_holds_a_finger_that_moves() -> None:
+    """A hand has no torque command: left alone, the finger would go to its target."""
+    bench = Bench().enable("index")
+    bench.move(goal("index", 100, speed=20))
+    bench.after(1)
+    report = bench.run(bench.driver.disable("index"))
+    assert (report.action, report.written, report.confirmed) == ("hold", True, True)
+    assert bench.after(5).hand.fingers[1].position == pytest.approx(0.2 * 65535, rel=0.05)
+    bench.frames()
+    assert bench.run(bench.driver.disable("index")).action == "none"
+    assert bench.frames() == []
