@@ -19,6 +19,7 @@ from servobus.config.access import DoorOptions, Role
 from servobus.daemon.fairness import FairShare, TokenBucket
 from servobus.daemon.jsonrpc import URGENT, Call, Framer, Refused, call_of, encode, failure, notification, parse, success, urgent
 from servobus.daemon.methods import HANDLERS, Services, require_role
+from servobus.daemon.standstill import StandStill
 from servobus.errors import ServobusError
 from servobus.rig.logs import EventLogger
 from servobus.rpc.clock import CallerClock
@@ -51,6 +52,7 @@ class Door(Protocol):
     options: DoorOptions
     services: Services
     share: FairShare
+    stand_still: StandStill
 
     def now(self) -> float: ...
 
@@ -72,11 +74,14 @@ class ClientConnection(asyncio.Protocol):
         self._name = ""
         self._tcp = tcp
         self._framer = Framer()
-        self._lines: deque[bytes] = deque()
+        self._lines: deque[tuple[bytes, float]] = deque()  # each with the moment since which it may have waited
         self._waiting = 0  # bytes that they take
+        self._since: float | None = None  # that moment of the line whose call begins now
         self._tasks: dict[asyncio.Task[None], Any] = {}  # each with the id of its call; None: it has none
         self._withdrawn: set[Any] = set()  # ids of calls that were cancelled while they waited
+        self._now = clock_of(door.loop)
         self._clock = CallerClock()
+        self._paused_at: float | None = None  # since when the socket is not read
         self._scheduled = False  # a next line will be handled without further ado
         self._paused = False  # the socket is not read
         self._closed = False
@@ -98,8 +103,10 @@ class ClientConnection(asyncio.Protocol):
         self.age(params.asked)
 
     def age(self, asked: float | None) -> float:
-        """Return the seconds since a call was made at `asked` of the client's clock."""
-        return self._clock.age(asked, clock_of(self.door.loop)())
+        """Return the seconds since a call was made at `asked` of the client's clock; None: since it may have been made."""
+        if asked is not None:
+            return self._clock.age(asked, self._now())
+        return 0.0 if self._since is None else self._now() - self._since
 
     def has_left(self) -> bool:
         """Return whether the client has closed its connection, which is noticed only when all it sent is read."""
@@ -165,6 +172,9 @@ class ClientConnection(asyncio.Protocol):
             self.write(refusal.reply() + b"\n")
             self._transport.close()
             return
+        since = self._now() - self.door.stand_still.seconds()
+        if self._paused_at is not None:
+            since, self._paused_at = min(since, self._paused_at), None
         ahead = []
         allowed = Counter(URGENT_CALLS)
         for line in lines:
@@ -173,12 +183,13 @@ class ClientConnection(asyncio.Protocol):
                 allowed.subtract(methods)
                 ahead.append(line)
             elif line.strip():
-                self._lines.append(line)
+                self._lines.append((line, since))
                 self._waiting += len(line) + OVERHEAD
         for line in ahead:
-            self._do(line)
+            self._do(line, since)
         if self._waiting > MAX_WAITING and not self._paused:
             self._paused = True
+            self._paused_at = self._now()
             self._transport.pause_reading()
         self._handle_lines()
 
@@ -199,9 +210,9 @@ class ClientConnection(asyncio.Protocol):
             self._scheduled = False
             self._withdrawn.clear()
             return False
-        line = self._lines.popleft()
+        line, since = self._lines.popleft()
         self._waiting -= len(line) + OVERHEAD
-        self._do(line)
+        self._do(line, since)
         if self._paused and self._waiting <= MAX_WAITING // 2 and not self._closed:
             self._paused = False
             self._transport.resume_reading()
@@ -216,7 +227,7 @@ class ClientConnection(asyncio.Protocol):
         self._scheduled = False
         self._handle_lines()
 
-    def _do(self, line: bytes) -> None:
+    def _do(self, line: bytes, since: float) -> None:
         try:
             messages = parse(line)
         except Refused as refusal:
@@ -238,7 +249,9 @@ class ClientConnection(asyncio.Protocol):
         if call.id in self._withdrawn:
             self._withdrawn.discard(call.id)
             return  # nobody waits for its reply
+        self._since = since
         result = self._begin(call)
+        self._since = None
         if isinstance(result, CoroutineType):
             self._spawn(self._finish(call, result), call.id if call.wants_reply else None)
         elif call.wants_reply:

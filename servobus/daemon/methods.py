@@ -38,7 +38,7 @@ class Client(Subscriber, Protocol):
         """Take its name, token and clock. Raises AccessDenied."""
 
     def age(self, asked: float | None) -> float:
-        """Return the seconds since it made a call, at `asked` of its clock."""
+        """Return the seconds since it made a call, at `asked` of its clock; None: the seconds since it may have made it."""
 
     def has_left(self) -> bool:
         """Return whether it has closed its connection."""
@@ -94,7 +94,7 @@ def _verb_handler(verb: Verb) -> Handler:
     def taken(services: Services, client: Client, params: Any) -> Any:
         rig, age = services.rig, client.age(params.asked)
         names = servos(verb, rig, params)
-        if age > PROMPT or params.asked is None:
+        if age > PROMPT:
             _refuse_absent(client)
         if not rig.stopped:  # what the e-stop refuses takes no lease
             services.leases.take(client, client.label, names)

@@ -16,6 +16,7 @@ from servobus.daemon.fairness import FairShare
 from servobus.daemon.lease_watch import LeaseWatch
 from servobus.daemon.methods import Services
 from servobus.daemon.sockets import BACKLOG, Tokens, claim, inode, peer_credentials, remove, tls_context
+from servobus.daemon.standstill import StandStill
 from servobus.daemon.subscriptions import Subscriptions
 from servobus.errors import ConfigError, Overloaded, ServobusError
 from servobus.rig.local import LocalRig
@@ -44,6 +45,7 @@ class NativeDoor:
         self.loop = asyncio.get_running_loop()
         self.now = self.loop.time
         self.share = FairShare(self.loop)
+        self.stand_still = StandStill(self.loop)
         self.leases = LeaseWatch(rig, self.options.lease_ms)
         self.subscriptions = Subscriptions(rig)
         self.services = Services(rig, self.leases, self.subscriptions)
@@ -128,6 +130,7 @@ class NativeDoor:
 
     async def close(self) -> None:
         """Accept nobody any more, and close every connection."""
+        self.stand_still.close()
         for server in self._servers:
             server.close()
         self.subscriptions.close()

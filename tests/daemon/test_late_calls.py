@@ -117,6 +117,39 @@ def standing_still(daemon: subprocess.Popen[str]) -> Iterator[None]:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["move_to", "move"])
+async def test_a_call_that_does_not_say_when_it_was_made_is_as_old_as_the_daemon_stood_still(method: str, tmp_path: Path) -> None:
+    config, path = tmp_path / "rig.yaml", tmp_path / "d" / "servobus.sock"
+    config.write_text(LIMP.replace("shoulder", "s1"))
+    with servobus("run", str(config), SERVOBUS_SOCKET=str(path)) as daemon:
+        until(daemon, "running")
+        async with dialled(path) as raw, dialled(path) as other:
+            await raw.call("enable", names=["s1"])
+            with standing_still(daemon):
+                answer = asyncio.create_task(raw.call(method, **GOALS[method]))
+                await asyncio.sleep(0.5)
+            assert (await answer)["type"] == "GoalExpired"
+            assert (await other.call("read", name="s1"))["goal"] == 0.0
+            await asyncio.sleep(0.2)
+            assert await raw.call(method, **GOALS[method]) in ACKED
+        daemon.terminate()
+        assert daemon.wait(10) == 0
+
+
+@virtual
+async def test_goals_of_a_flood_that_waited_for_their_turn_are_not_sent_late(tmp_path: Path) -> None:
+    async with served(tmp_path, rate=10) as (_, _, path), dialled(path) as raw:
+        await ready(raw)
+        numbers = [raw.ask("move_to", name="s1", position=10 + each) for each in range(20)]
+        answers: dict[int, str] = {}
+        while len(answers) < len(numbers):
+            message = await raw.line()
+            answers[message["id"]] = message.get("result") or message["error"]["data"]["type"]
+        assert {*answers.values()} == {"acked", "superseded", "GoalExpired"}
+        assert answers[numbers[-1]] == "GoalExpired"
+
+
+@pytest.mark.slow
 async def test_goals_that_waited_for_a_daemon_that_stood_still_are_not_sent(tmp_path: Path) -> None:
     config, path = tmp_path / "rig.yaml", tmp_path / "d" / "servobus.sock"
     config.write_text(LIMP)
