@@ -75,6 +75,9 @@ def test_a_signal_never_opens_a_bus_again_whose_servo_is_enabled(rig: str) -> No
         with servobus("enable", "elbow") as enabling:
             enabling.communicate(timeout=20)
         text = Path(rig).read_text()
+        Path(rig).write_text(text.replace("feedback: 50", "feedback: 40"))
+        process.send_signal(signal.SIGHUP)
+        assert until(process, "reloaded")["updated"] == ["arm"]
         Path(rig).write_text(text.replace("id: 1", "id: 9"))
         process.send_signal(signal.SIGHUP)
         assert "opens again arm, while these servos are enabled or owe a stop: arm/elbow" in str(

@@ -13,6 +13,10 @@ from servobus.values import Reload
 from tests.virtual_time import virtual
 
 BUSES = {
+    "sts": ("protocol: sms, baudrate: 1000000", "id: 1, model: sts"),
+    "sms": ("protocol: sms, baudrate: 115200", "id: 1, model: sms"),
+    "sms_cl": ("protocol: sms, baudrate: 115200", "id: 1, model: sms_cl"),
+    "scs": ("protocol: sms, baudrate: 1000000", "id: 1, model: scs"),
     "kst": ("protocol: kst, baudrate: 512000", "id: 1"),
     "roh": ("protocol: roh, baudrate: 115200", "id: 2, channel: index"),
 }
