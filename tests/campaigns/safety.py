@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
-from tests.campaigns import scenarios_goals, scenarios_stops
+from tests.campaigns import scenarios_goals, scenarios_stops, scenarios_troubles
 from tests.campaigns.bench import Case, Figures
 from tests.virtual_time import VirtualLoop
 
@@ -30,7 +30,8 @@ class Rule:
     """Over all cases, where the whole campaign is run."""
 
 
-RULES = [Rule(name, scenario, cases, runs) for name, scenario, cases, runs in (*scenarios_goals.RULES, *scenarios_stops.RULES)]
+ROWS = (*scenarios_goals.RULES, *scenarios_stops.RULES, *scenarios_troubles.RULES)
+RULES = [Rule(name, scenario, cases, runs) for name, scenario, cases, runs in ROWS]
 
 
 def run(rule: Rule, case: Case, runs: int, seed: int = 1) -> Figures:

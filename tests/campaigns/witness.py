@@ -12,7 +12,7 @@ import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
 from urllib.parse import SplitResult
@@ -24,6 +24,8 @@ from servobus.timers import FineTimer, clock_of
 
 NEVER = -1.0
 REPLY_DELAY = 0.0002
+CHECKED_RATE = 9600
+"""The rate of a link that is made to check its address alone."""
 
 
 @dataclass(slots=True)
@@ -189,15 +191,21 @@ class WitnessLine(ABC):
         """Let the servos do what the frame asks for; yield their replies."""
 
 
-@dataclass(slots=True)
 class Lines:
-    """The witness lines by the host name of their address."""
+    """One link to each witness line, by the host name of its address: a config that is only checked makes no other."""
 
-    lines: dict[str, WitnessLine] = field(default_factory=dict)
+    def __init__(self, lines: dict[str, WitnessLine]) -> None:
+        self._lines = lines
+        self._links: dict[str, MemoryLink] = {}
 
     def build(self, parts: SplitResult, baudrate: int) -> MemoryLink:
-        assert parts.hostname is not None
-        return MemoryLink(self.lines[parts.hostname], LineTraits(baudrate, paced=True), parts.geturl())
+        name = parts.hostname
+        assert name is not None
+        if name not in self._links:
+            self._links[name] = MemoryLink(self._lines[name], LineTraits(paced=True), parts.geturl())
+        if baudrate != CHECKED_RATE:
+            self._links[name].traits = LineTraits(baudrate, paced=True)
+        return self._links[name]
 
 
 @contextmanager

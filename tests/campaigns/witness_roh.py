@@ -17,6 +17,8 @@ STATUS, CURRENT_LIMIT, SPEED, POS_TARGET, POS, END = 1085, 1095, 1125, 1135, 114
 CHANNELS = 6
 FULL_SPEED = 65535.0
 NO_ANSWER = 0x0B
+BOOT = 0.05
+"""Seconds that it needs to start, beside its self-test."""
 
 
 class RohHand(WitnessServo):
@@ -53,7 +55,7 @@ class RohHand(WitnessServo):
     def cut_power(self, now: float, seconds: float) -> None:
         """It opens its fingers as it starts: that is its own, and ends with the power."""
         self.advance(now)
-        self.off_until = now + seconds
+        self.off_until = now + seconds + BOOT
         self._start()
         for finger in self.fingers:
             finger.position = 0.0

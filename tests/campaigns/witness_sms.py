@@ -19,6 +19,8 @@ TORQUE, GOAL, PWM, SPEED, TORQUE_LIMIT = 40, 42, 44, 46, 48
 POSITION, FLAG, STATUS, MOVING, GOAL_NOW = 56, 64, 65, 66, 67
 FULL_SPEED = 3000.0
 OVERLOAD = 0x20
+BOOT = 0.05
+"""Seconds that it needs to start; the vendor's protocol page says 1.8 s of a reboot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,7 @@ class SmsServo(WitnessServo):
 
     def cut_power(self, now: float, seconds: float) -> None:
         self.advance(now)
-        self.off_until = now + seconds
+        self.off_until = now + seconds + BOOT
         self._start()
 
     def trip(self) -> None:
