@@ -13,5 +13,5 @@ ROWS = [pytest.param(rule, case, id=f"{rule.name}: {case}") for rule in RULES fo
 
 @pytest.mark.parametrize(("rule", "case"), ROWS)
 def test_nothing_moves_by_surprise(rule: Rule, case: Case) -> None:
-    figures = safety.run(rule, case, 2)
+    figures = safety.run(rule, case, 1)
     assert figures.kept(), figures
