@@ -61,6 +61,7 @@ class Verification:
         passed = self._passed
         if passed and all([passed.pop(ticket.goal.servo, 0.0) > now for ticket in tickets]):  # noqa: C419 - it pops each
             self.max_age = min(max(MIN_AGE, COST * (now - self._asked_at)), MAX_AGE)
+            verified.update(dict.fromkeys([ticket.goal.servo for ticket in tickets], self._asked_at))
             return None
         servos = [ticket.goal.servo for ticket in tickets]
         plan = self._driver.verify(servos)

@@ -89,7 +89,19 @@ def test_a_slow_turn_of_another_class_costs_no_second_verification() -> None:
     assert isinstance(rig.scheduler.next_job(0.0), Job)
     assert run(rig.scheduler.next_job(4 * MIN_AGE)) == [255]
     rig.coalescer.put(ticket(1, ended, expires=9.0))
-    assert run(rig.scheduler.next_job(4 * MIN_AGE)) == [1], "it counts for one goal"
+    assert run(rig.scheduler.next_job(MAX_AGE)) == [1], "it counts from when it was asked for"
+
+
+def test_a_stream_of_goals_is_verified_once_in_a_while() -> None:
+    rig, ended, asked = bench(), [], []  # type: ignore[var-annotated]
+    for number in range(100):
+        rig.coalescer.put(ticket(1, ended, expires=9.0))
+        now = number * MIN_AGE / 10
+        asked += run(rig.scheduler.next_job(now))
+        if asked[-1] == 1:
+            asked += run(rig.scheduler.next_job(now))
+    assert asked.count(255) == 100
+    assert asked.count(1) in (10, 11)
 
 
 def test_a_verification_that_no_goal_used_counts_no_longer() -> None:
