@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
-from tests.campaigns import scenarios_goals, scenarios_stops, scenarios_troubles
+from tests.campaigns import commands, scenarios_goals, scenarios_stops, scenarios_troubles
 from tests.campaigns.bench import Case, Figures
 from tests.virtual_time import VirtualLoop
 
@@ -28,10 +28,13 @@ class Rule:
     cases: Sequence[Case]
     runs: int
     """Over all cases, where the whole campaign is run."""
+    real: bool = False
+    """In real time, with processes."""
 
 
 ROWS = (*scenarios_goals.RULES, *scenarios_stops.RULES, *scenarios_troubles.RULES)
 RULES = [Rule(name, scenario, cases, runs) for name, scenario, cases, runs in ROWS]
+COMMANDS = [Rule(name, scenario, cases, runs, real=True) for name, scenario, cases, runs in commands.RULES]
 
 
 def run(rule: Rule, case: Case, runs: int, seed: int = 1) -> Figures:
@@ -39,7 +42,7 @@ def run(rule: Rule, case: Case, runs: int, seed: int = 1) -> Figures:
     figures = Figures()
     for number in range(runs):
         rng = random.Random(f"{rule.name}/{case}/{seed}/{number}")
-        with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        with asyncio.Runner(loop_factory=None if rule.real else VirtualLoop) as runner:
             runner.run(_once(rule.scenario, case, rng, figures))
         figures.runs += 1
     return figures
@@ -52,7 +55,7 @@ async def _once(scenario: Scenario, case: Case, rng: random.Random, figures: Fig
         figures.broken.append(f"{type(error).__name__}: {error.message}")
 
 
-def safety(share: float, rules: Sequence[Rule] = tuple(RULES)) -> bool:
+def safety(share: float, rules: Sequence[Rule] = (*RULES, *COMMANDS)) -> bool:
     """Run every row and print the table. `share`: of the runs of the whole campaign."""
     kept = True
     head = ("travel", "false stops", "owed", "fired", "energised")

@@ -15,3 +15,13 @@ ROWS = [pytest.param(rule, case, id=f"{rule.name}: {case}") for rule in RULES fo
 def test_nothing_moves_by_surprise(rule: Rule, case: Case) -> None:
     figures = safety.run(rule, case, 1)
     assert figures.kept(), figures
+
+
+COMMANDS = [pytest.param(rule, case, id=f"{rule.name}: {case}") for rule in safety.COMMANDS for case in rule.cases]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rule", "case"), COMMANDS)
+def test_no_command_moves_by_surprise(rule: Rule, case: Case) -> None:
+    figures = safety.run(rule, case, 1)
+    assert figures.kept(), figures
