@@ -53,7 +53,7 @@ class Ending:
         servos = self.energised() if self.energised is not None else {}
         listing = ", ".join(f"{name} ({action})" for name, action in servos.items())
         if servos and self.has_daemon:
-            self.say(f"interrupted: the daemon does on_lost_client of what this command moved, of {listing}")
+            self.say(f"interrupted: the daemon does on_lost_client of what this command moves; energised: {', '.join(servos)}")
         elif servos:
             self.say(f"interrupted: doing on_exit of {listing}; interrupt again to end at once")
 

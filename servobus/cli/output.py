@@ -120,7 +120,7 @@ def state_row(name: str, state: State) -> tuple[object, ...]:
         _tenths(state.voltage),
         state.temperature,
         state.current,
-        "moving" if state.moving else "enabled" if state.enabled else None,
+        "moving" if state.moving else "enabled" if state.enabled else "energised" if state.energised else None,
         state.health,
         state.faults or None,
     )

@@ -29,7 +29,15 @@ def socket_path(environ: Mapping[str, str] = os.environ) -> Path:
 
 def find_socket(environ: Mapping[str, str] = os.environ) -> Path | None:
     """The path of a socket that exists at a usual place: the user's before the system's; None: there is none."""
-    return next((path for path in _usual(environ) if path.is_socket()), None)
+    return next((path for path in _usual(environ) if _may_be_socket(path)), None)
+
+
+def _may_be_socket(path: Path) -> bool:
+    """One that this user may not see is taken to be there: connecting to it says what is missing."""
+    try:
+        return path.is_socket()
+    except PermissionError:
+        return True
 
 
 def _usual(environ: Mapping[str, str]) -> list[Path]:

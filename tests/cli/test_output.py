@@ -8,12 +8,13 @@ from typing import cast
 import pytest
 
 from servobus.cli.options import Options
-from servobus.cli.output import show, table
+from servobus.cli.output import STATE_COLUMNS, show, state_row, table
 from servobus.cli.rig_context import open_context
 from servobus.errors import DeviceError
 from servobus.rig.interface import Rig
 from servobus.rig.local import LocalRig
 from servobus.simulation.link import SimulatedLink
+from servobus.values import State
 from tests.config.mistakes import GOOD
 
 
@@ -69,6 +70,20 @@ async def test_confirmed_exit_policies_are_no_error(options: Options) -> None:
 )
 def test_cells(value: object, shown: str) -> None:
     assert show(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("state", "shown"),
+    [
+        (State(), None),
+        (State(energised=False), None),
+        (State(energised=True), "energised"),
+        (State(enabled=True, energised=True), "enabled"),
+        (State(enabled=True, energised=True, moving=True), "moving"),
+    ],
+)
+def test_a_servo_that_somebody_else_energised_is_shown(state: State, shown: str | None) -> None:
+    assert state_row("arm/s1", state)[STATE_COLUMNS.index("state")] == shown
 
 
 def test_numbers_are_on_the_right_and_text_on_the_left() -> None:
