@@ -280,6 +280,7 @@ class StopTarget:
     position: float | None = None  # where it is taken to be now: to be written only where it cannot be asked
     setpoint: float | None = None  # the last position that was sent or held; None: not known
     reachable: bool = True  # False: known to be offline; it is written to, and not waited for
+    energised: bool = False  # its torque was on when it was last read, whoever switched it on
 
 
 @dataclass(frozen=True, slots=True)

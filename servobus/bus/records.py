@@ -74,6 +74,11 @@ class ServoRecord:
         self.generation += 1
         self.enabled = False
 
+    @property
+    def energised(self) -> bool:
+        """Whether its torque was on when it was last read."""
+        return bool(self._fields.get("energised"))
+
     def torque_is(self, *, on: bool) -> None:
         """Note that its torque was read back, on or off."""
         if "energised" in self._fields:

@@ -135,6 +135,7 @@ class Stops:
             position=record.estimate(self._parts.clock(), ESTIMATE_AGE),
             setpoint=record.setpoint,
             reachable=record.node.health is not OFFLINE,
+            energised=record.energised,
         )
 
     # Stops that are owed

@@ -17,7 +17,8 @@
    A servo that does not answer gets the estimate once; it delays the others by its own turn alone.
 3. What we armed with REG WRITE is disarmed.
 
-A position that does not agree with the estimate is read twice before it is written.
+One reading is not believed where it surprises: a position that does not agree with the estimate, another mode than identified,
+torque 0 where it was on. It is read again before anything follows from it.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ class Stopper:
     def _round(self, group: Sequence[Stop], number: int) -> Plan[None]:
         """Read these servos, and write what their rules ask for."""
         yield from self._read(group, 0)
-        for more in (1, 2):  # a position that nothing bears out is read again
+        for more in (1, 2):  # what nothing bears out is read again
             if doubtful := [stop for stop in group if stop.is_doubtful]:
                 yield from self._read(doubtful, more)
         writes = [(stop.servo, write) for stop in group if (write := stop.next_write(number)) is not None]

@@ -25,7 +25,7 @@ Writes = tuple[Register, int]
 class Stop:
     """The stop of one servo, as far as it has come."""
 
-    __slots__ = ("_before", "_blind", "_goal", "_motion", "_positions", "report", "servo", "silences", "target")
+    __slots__ = ("_before", "_blind", "_goal", "_readings", "report", "servo", "silences", "target")
 
     def __init__(self, servo: HostServo, target: StopTarget) -> None:
         self.servo = servo
@@ -33,10 +33,8 @@ class Stop:
         self.silences = 0
         self._before: Registers | None = None
         """What was read in the round before."""
-        self._motion: Registers | None = None
-        """What was read in this round; None: it did not answer."""
-        self._positions: list[int] = []
-        """The positions that were read in this round."""
+        self._readings: list[Registers] = []
+        """What was read in this round, the newest last; empty: it did not answer."""
         self._goal: int | None = None
         """The position that was last written as goal."""
         self._blind = False
@@ -84,32 +82,48 @@ class Stop:
         """Take a reading of this round; None: there was none, for this reason."""
         if motion is None:
             self.silences += 1
-            self._motion = None
+            self._readings = []
             self._report(self.report.action, confirmed=False, detail=detail)
             return
         self.silences = 0
-        self._motion = motion
-        self._positions.append(motion[self.servo.model.state["position"]])
+        self._readings.append(motion)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a position is needed, and neither the estimate nor another reading bears out what was read."""
-        if self._motion is None or not self._holds_position(self._motion):
+        """Whether nothing bears out the last reading: neither what is known of the servo nor another reading."""
+        return bool(self._readings) and (self._is_odd or self._is_elsewhere)
+
+    @property
+    def _is_odd(self) -> bool:
+        """Whether another mode than known, or torque 0 where it was on, was read once only."""
+        *others, last = map(self._state_of, self._readings)
+        expected = [(self._mode(None), True)]
+        if not (self.target.enabled or self.target.energised) or "limp" in (self.target.kind, self.report.action):
+            expected.append((self._mode(None), False))
+        return last not in (*expected, *others)
+
+    @property
+    def _is_elsewhere(self) -> bool:
+        """Whether a position is needed, and was read where nothing else has it."""
+        *others, last = self._readings
+        if not self._holds_position(last):
             return False
-        last, *others = reversed(self._positions)
-        estimate = self.target.position
-        witnesses = others if estimate is None else [*others, self.servo.calibration.to_raw(estimate)]
+        name, estimate = self.servo.model.state["position"], self.target.position
+        witnesses = [reading[name] for reading in others]
+        witnesses += [] if estimate is None else [self.servo.calibration.to_raw(estimate)]
         witnesses += [] if self._goal is None else [self._goal]
-        return not any(abs(last - witness) <= NEAR for witness in witnesses)
+        return not any(abs(last[name] - witness) <= NEAR for witness in witnesses)
 
     def next_write(self, number: int) -> Writes | None:
         """Return what this round writes after it has read; None: nothing. The report says what is confirmed."""
-        motion, positions = self._motion, self._positions
-        self._motion, self._positions = None, []
-        if motion is None:
+        if not self._readings:
             return self._written(self.estimate())
-        before, self._before = self._before, motion
-        return self._written(self._rule(motion, before, positions, number))
+        odd, readings, self._readings = self._is_odd, self._readings, []
+        if odd:
+            return self._report(self.report.action, confirmed=False, detail="mode and torque read differently each time")
+        before, self._before = self._before, readings[-1]
+        positions = [reading[self.servo.model.state["position"]] for reading in readings]
+        return self._written(self._rule(readings[-1], before, positions, number))
 
     def _rule(self, motion: Registers, before: Registers | None, positions: list[int], number: int) -> Writes | None:
         if self.target.kind == "limp" or self.report.action == "limp":
@@ -165,6 +179,10 @@ class Stop:
     @property
     def _torque_off(self) -> Writes:
         return self.servo.model.registers[self.servo.model.torque], 0
+
+    def _state_of(self, motion: Registers) -> tuple[str, bool]:
+        """Return mode, and whether torque is on."""
+        return self._mode(motion), motion[self.servo.model.torque] != 0
 
     def _mode(self, motion: Registers | None) -> str:
         """Return the mode that was just read, or the one that was identified."""
