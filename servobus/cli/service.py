@@ -23,7 +23,7 @@ def run(config: str, log_every: float) -> None:
     Polls at the rates of the config, waits for ports that are missing, and logs on standard error (as JSON where that is not a
     terminal). Writes nothing to a servo at start. Commands and `servobus.connect()` find the daemon by its socket: at
     SERVOBUS_SOCKET, else in $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/servobus or /run/servobus. SIGHUP reads CONFIG again. At the end
-    servobus does the `on_exit` of each servo that is enabled.
+    servobus does the `on_exit` of each servo that is enabled, and says so; a second signal ends it at once.
 
     Example: servobus run config/arm.yaml
     """

@@ -23,7 +23,7 @@ from servobus.rig.interface import Rig
 from servobus.rig.latch import LatchFile
 from servobus.rig.logs import EventLogger
 from servobus.rig.results import outcomes, raise_failures, uncancelled
-from servobus.rig.supervisor import BusSupervisor, Trace
+from servobus.rig.supervisor import BusSupervisor, Trace, why_not_to_close
 from servobus.values import Change, EventName, Goal, Identity, Outcome, Reload, ScanHit, Snapshot, State, StopReport
 
 R = TypeVar("R")
@@ -119,13 +119,10 @@ class LocalRig(Rig):
         updated = tuple(name for name in differing if self.buses[name].use_options(config.buses[name]))
         kept = {name for name in same if name in updated or name not in differing}
         gone = {name: supervisor for name, supervisor in self.supervisors.items() if name not in kept}
-        if not force and (busy := [name for bus in gone.values() for name in bus.in_use()]):
+        if reason := why_not_to_close(gone, force=force):
             for name in updated:
                 self.buses[name].use_options(self.config.buses[name])
-            what = f"the new config closes or opens again {', '.join(gone)}"
-            raise Busy(
-                f"{what}, while these servos are enabled or owe a stop: {', '.join(busy)}; disable them first, or force it"
-            )
+            raise Busy(reason)
         self.left.update(await self._leave(gone.values()))
         await asyncio.gather(*map(self._end, gone.values()))
         latched = self.stopped

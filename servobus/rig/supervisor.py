@@ -120,3 +120,14 @@ class BusSupervisor:
         await self.bus.master.close()
         if isinstance(self.link, SimulatedLink):
             self.link.close()
+
+
+def why_not_to_close(buses: Mapping[str, BusSupervisor], *, force: bool) -> str:
+    """Why a reload must not close these buses now; empty: it may. Enabled servos and owed stops are no reason if it is forced."""
+    if sessions := [name for name, each in buses.items() if each.bus.scheduler.session is not None]:
+        return f"a scan or commissioning session has {', '.join(sessions)}, which the new config closes: wait until it ends"
+    servos = [] if force else [name for each in buses.values() for name in each.in_use()]
+    if not servos:
+        return ""
+    what = f"the new config closes or opens again {', '.join(buses)}"
+    return f"{what}, while these servos are enabled or owe a stop: {', '.join(servos)}; disable them first, or force it"

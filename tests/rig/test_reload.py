@@ -103,6 +103,19 @@ async def test_a_bus_that_owes_a_stop_is_not_opened_again(path: Path) -> None:
         assert await rig.reload() == Reload(changed=("arm",))
 
 
+@pytest.mark.parametrize("force", [False, True])
+@virtual
+async def test_a_session_is_not_torn(path: Path, force: bool) -> None:
+    async with open_rig(path) as rig:
+        scanning = asyncio.create_task(rig.scan("arm", ids=[1]))
+        await asyncio.sleep(0.001)
+        write(path, TWO.replace("id: 1,", "id: 7,"))
+        with pytest.raises(Busy, match="a scan or commissioning session has arm"):
+            await rig.reload(force=force)
+        assert [hit.id for hit in await scanning] == [1]
+        assert await rig.reload(force=force) == Reload(changed=("arm",))
+
+
 @virtual
 async def test_buses_come_and_go(path: Path) -> None:
     async with open_rig(path) as rig:
