@@ -130,6 +130,8 @@ class Stop:
             return self._limp(motion, "torque still reads on")
         if not motion[self.servo.model.torque]:
             return self._report("none", confirmed=True, detail=self._why_limp(motion))
+        if self._blind and motion[self.servo.model.sentinel.name] == self.servo.model.sentinel.reset:
+            return self._limp(motion, "it had restarted, and the blind hold energised it: torque was switched off")
         mode = self._mode(motion)
         if mode == "position":
             return self._hold(motion, positions)

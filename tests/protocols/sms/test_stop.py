@@ -302,6 +302,28 @@ def test_a_silent_servo_is_held_where_it_is_taken_to_be(family: str) -> None:
     assert bench.instructions() == ["READ", "SYNC_WRITE", "READ", "READ"], "the estimate is never repeated"
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_blind_hold_that_energised_a_restarted_servo_is_taken_back(family: str) -> None:
+    bench = Bench({"a": {"id": 1, "model": family, "unit": "step"}})
+    bench.enable()
+    device = bench.devices[1]
+    silent = [True]
+
+    def restarts(packet: Packet) -> bool:
+        if silent and packet.code == Instruction.READ:
+            silent.clear()
+            device.restart(bench.now)
+            return True
+        return False
+
+    bench.is_lost = restarts
+    report = stop(bench, target("a", position=50.0))["a"]
+    assert (report.action, report.confirmed) == ("limp", True)
+    assert "it had restarted" in report.detail
+    assert bench.register(1, "torque_enable") == 0
+    assert travel(bench, device) == 0
+
+
 def test_a_silent_servo_that_was_limp_is_not_written_to() -> None:
     bench = Bench()
     bench.is_lost = lambda packet: True
