@@ -65,7 +65,8 @@ class DuplexEngine(Engine):
             request = self._following_request(now)
             if request is not None:
                 return self._transmit(request, now)
-            at = self.scheduler.wake()
+            # A job that was taken waits for the end of the turns under way, and everything else for that job.
+            at = self.scheduler.rest(now) if self.runner.job is None else None
         self.deliver()
         return IDLE if at is None else WaitUntil(at)
 

@@ -9,6 +9,7 @@ import pytest
 
 from servobus.config.loader import parse_config
 from servobus.engine.duplex import DuplexEngine
+from servobus.engine.engine import WaitUntil
 from servobus.errors import ReplyTimeout
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.rig.local import LocalRig, open_rig
@@ -157,3 +158,24 @@ async def test_a_plan_waits_until_the_line_is_empty_and_has_it_alone() -> None:
         assert [identity.model for identity in identities] == ["kst"] * 3
         assert await asyncio.gather(*reading) == [0.0] * SERVOS
         assert link_of(rig).line.collisions == 0
+
+
+@virtual
+async def test_while_a_plan_waits_for_the_turn_under_way_nothing_else_wakes_the_engine() -> None:
+    """What is due meanwhile waits for that plan: to wake up for it would be to wake up again and again."""
+    async with open_rig(config("full")) as rig:
+        await rig.enable("k2")
+        await asyncio.sleep(0.1)
+        bus = rig.buses["line"]
+        devices(rig)[0].dead = True
+        reading = asyncio.create_task(rig.read_register("k1", "position"))
+        moving = asyncio.create_task(rig["k2"].move_to(10))
+        await asyncio.sleep(0.001)
+        now = bus.clock()
+        bus.scheduler.set_polls(bus.driver.polls({"feedback": 50}), now - 1)
+        assert bus.engine.in_flight == 1
+        action = bus.engine.next_action(now)
+        assert not isinstance(action, WaitUntil) or action.when > now
+        await moving
+        with pytest.raises(ReplyTimeout):
+            await reading
