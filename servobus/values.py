@@ -164,7 +164,7 @@ class State:
         faults: Names of the faults that it reports.
         status: The status byte from which they are taken.
         health: Whether its node answers.
-        time: Monotonic seconds of the newest field.
+        time: Monotonic seconds when the position was read; those of the newest field where it never was.
         age: Seconds from `time` to when this State was made.
     """
 

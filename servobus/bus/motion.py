@@ -253,6 +253,8 @@ class Motion:
         moving = record.enabled
         near = self._near(servo) if tolerance is None else tolerance
         end = parts.clock() + timeout
+        before: State | None = None
+        step = parts.driver.step(servo)
         while True:
             self._refuse_to_settle(record, moving, parking)
             state = await self._read(servo, SETTLE_PERIOD)
@@ -260,8 +262,9 @@ class Motion:
                 state = await self._read(servo, None)
             self._refuse_to_settle(record, moving, parking)  # a stop or a restart meanwhile has changed its goal
             there = record.goal is None or (state.position is not None and abs(state.position - record.goal) <= near)
-            if there and not state.moving and servo not in parts.scheduler.goals.ramps.active:
+            if there and servo not in parts.scheduler.goals.ramps.active and (record.goal is None or _rests(state, before, step)):
                 return state
+            before = state
             if parts.clock() >= end:
                 raise SettleTimeout(
                     f"the servo did not settle within {timeout:g} s: it is at {state.position}, its goal is {record.goal}",
@@ -281,6 +284,15 @@ class Motion:
 
     def _near(self, servo: str) -> float:
         return TOLERANCE_STEPS * self._parts.driver.step(servo)
+
+
+def _rests(state: State, before: State | None, step: float) -> bool:
+    """Return whether a servo rests: it says so, or two readings agree that are half a period apart or more."""
+    if state.moving is not None:
+        return not state.moving
+    if before is None or state.position is None or before.position is None or state.time is None or before.time is None:
+        return False
+    return abs(state.position - before.position) <= step and state.time - before.time >= SETTLE_PERIOD / 2
 
 
 OUTCOME_COUNTERS = {

@@ -123,6 +123,7 @@ class ServoRecord:
     def state(self, now: float, faults: tuple[str, ...]) -> State:
         fields = dict(self._fields)
         status = fields.pop("status", None)
+        time = self.updated_at if self.position_at is None else self.position_at
         goal = fields.pop("goal", None)
         return State(
             **fields,
@@ -131,6 +132,6 @@ class ServoRecord:
             faults=faults,
             status=status if self.node.status is None else self.node.status,
             health=self.node.health,
-            time=self.updated_at,
-            age=None if self.updated_at is None else now - self.updated_at,
+            time=time,
+            age=None if time is None else now - time,
         )

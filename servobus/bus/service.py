@@ -23,7 +23,7 @@ from servobus.engine.health import MAX_ALLOWANCE, OFFLINE, ONLINE, Node, NodeTab
 from servobus.engine.line import EchoFilter, Line
 from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats, Counter
-from servobus.errors import NotSupported
+from servobus.errors import NotSupported, ServobusError
 from servobus.protocols.base import Codec, Driver, LineTraits, Request
 from servobus.protocols.options import BusOptions, ServoOptions
 from servobus.timers import clock_of
@@ -124,9 +124,9 @@ class BusService:
         return self.state(servo)
 
     def is_fresh(self, servo: str, max_age: float) -> bool:
-        """Return whether the newest state of a servo is no older than `max_age` seconds."""
-        updated_at = self.records[servo].updated_at
-        return updated_at is not None and self.clock() - updated_at <= max_age
+        """Return whether the position of a servo was read within `max_age` seconds: some polls bring only other fields."""
+        position_at = self.records[servo].position_at
+        return position_at is not None and self.clock() - position_at <= max_age
 
     def state(self, servo: str) -> State:
         """Return the newest state of a servo, without a turn."""
@@ -194,6 +194,7 @@ class BusService:
 
     def _cut(self, servo: str, error: Exception) -> None:
         """A setpoint of the host's ramp failed on the way."""
+        self.records[servo].cut = error if isinstance(error, ServobusError) else None
         self.emit(EventName.MOTION_CUT, bus=self.name, servo=servo, reason=str(error))
 
     def _lost(self, servo: str, loss: Loss) -> None:

@@ -35,7 +35,7 @@ from servobus.protocols.base import Request
 from servobus.values import EventName, StopReport, StopTarget
 
 ESTIMATE_AGE = 0.1
-"""Seconds after its last reading for which a servo is held blindly: one that has restarted meanwhile does not take a frame yet."""
+"""Seconds after its last reading for which a servo is held blindly: one that restarted meanwhile does not take a frame yet."""
 PAUSE = 0.05
 """Seconds between two stops of a servo that answers and does not confirm."""
 TOLERANCE_STEPS = 10

@@ -13,13 +13,18 @@ from typing import Any
 
 from servobus.cli.ending import of_command
 from servobus.cli.options import BusFacts, Options, RigContext
-from servobus.errors import LinkDown, NotSupported
+from servobus.errors import InvalidRequest, LinkDown, NotSupported
 from servobus.remote.address import NoDaemon
 from servobus.remote.rig import RemoteRig, connect
 from servobus.rpc.socket_path import VARIABLE, find_socket
 from servobus.values import Health, State, StopReport
 
 KEPT = "the daemon keeps it; `servobus disable` switches its torque off"
+GONE = "the connection to the daemon is lost: if it has died, nobody stops the servo; `servobus disable --direct` does"
+OTHERS = (
+    "the daemon at {address} has no bus of {config}: which of the two is meant? Leave the config out (-c, SERVOBUS_CONFIG), or "
+    "open its ports in this process (--direct); nothing was sent"
+)
 TRACE_REFUSED = "a daemon has this bus, and --trace shows only the frames of this process: stop the daemon, or omit --trace"
 
 
@@ -74,7 +79,8 @@ def _said_when_it_fails(rig: RemoteRig, names: Collection[str]) -> Iterator[None
         yield
     except BaseException:
         for name, state in energised().items():
-            ending.left[name] = StopReport("stays", False, state.health is not Health.OFFLINE, KEPT)
+            confirmed = rig.connected and state.health is not Health.OFFLINE
+            ending.left[name] = StopReport("stays", False, confirmed, KEPT if rig.connected else GONE)
         raise
 
 
@@ -99,6 +105,8 @@ async def _connect(stack: AsyncExitStack, options: Options) -> RemoteRig | None:
         served, own = await buses_of(rig), config_of(options).buses
         if not any(name in served and served[name].port == bus.port for name, bus in own.items()):
             await stack.aclose()
+            if options.socket:
+                raise InvalidRequest(OTHERS.format(address=address, config=options.config))
             return None
     if options.trace:
         raise NotSupported(TRACE_REFUSED)

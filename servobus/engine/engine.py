@@ -155,7 +155,8 @@ class Engine:
         reason = str(cause) if cause else "closed"
         for job in dict.fromkeys(begun):
             if job is not None:
-                message = f"the line went down while this was under way ({reason}): it may have been applied"
+                applied = ": it may have been applied" if job.changes else ""
+                message = f"the line went down while this was under way ({reason}){applied}"
                 job.fail(LinkDown(message, bus=self.bus))
         self.scheduler.drop(
             lambda _: LinkDown(f"the line went down ({reason}): nothing was sent", bus=self.bus), motion_only=False

@@ -99,6 +99,7 @@ class Job:
         "_fence",
         "_resume",
         "attempts",
+        "changes",
         "even_if_offline",
         "expires",
         "fencing",
@@ -146,6 +147,8 @@ class Job:
         """How often one of its idempotent requests may be sent."""
         self.attempts = 0
         """How often the present request was sent in vain."""
+        self.changes = request is not None and request.changes
+        """It has asked for a change, which may be done where it fails."""
         self.fencing = kind is JobKind.PROBE
         """Its present request belongs to a fence."""
         self._fence: Plan[bool] | None = None
@@ -194,7 +197,8 @@ class Job:
     def _in_plan(self, step: Step) -> Step:
         self.attempts = 0
         if isinstance(step, Send):
-            self.request = step.request
+            self.request = request = step.request
+            self.changes = self.changes or request.changes
         return step
 
     def _in_fence(self, step: Step, *, last: bool = False) -> Step:

@@ -142,7 +142,7 @@ class JobRunner:
         too_late = job.kind is JobKind.MOTION and now >= job.expires
         # The request of a fence is not repeated as it was: its reply may still come, and must be fenced again.
         if not request.idempotent or job.fencing or too_late or job.attempts >= job.tries or offline:
-            self._apply(job, job.give_up(self._timeout(job.attempts, request), offline=offline))
+            self._apply(job, job.give_up(self._timeout(job, request), offline=offline))
             return
         self.stats.counts[Counter.RETRIES] += 1
         job.request = (request.plain() if turn.echoes else None) or request
@@ -151,14 +151,12 @@ class JobRunner:
                 self.job = None
             self.scheduler.retry(job)
 
-    def _timeout(self, attempts: int, request: Request[Any]) -> ReplyTimeout:
-        tries = "1 try" if attempts == 1 else f"{attempts} tries"
-        return ReplyTimeout(
-            f"no answer after {tries}: is it powered, are id and baud rate right? What was asked may have been applied",
-            bus=self.bus,
-            request=request,
-            raw=request.frame,
-        )
+    def _timeout(self, job: Job, request: Request[Any]) -> ReplyTimeout:
+        tries = "1 try" if job.attempts == 1 else f"{job.attempts} tries"
+        message = f"no answer after {tries}: is it powered, are id and baud rate right?"
+        if job.changes:
+            message += " What was asked may have been applied"
+        return ReplyTimeout(message, bus=self.bus, request=request, raw=request.frame)
 
     def estopped(self, servo: str) -> ServobusError:
         return EStopped("the e-stop came first: nothing more was sent", bus=self.bus, servo=servo or None)

@@ -80,6 +80,8 @@ class Request(ABC, Generic[R]):
     """Two requests with the same key have replies that can be mistaken for each other."""
     idempotent: bool = True
     """It may be sent again when no reply came."""
+    changes: bool = True
+    """It asks the device to change something, which may be done where no reply came."""
     quiet_after: float = 0.0
     """Seconds of silence that must follow the request."""
     service_time: float = 0.0

@@ -17,6 +17,7 @@ import msgspec
 from servobus.errors import InvalidRequest, LimitError, LinkDown, Overloaded, ReplyTimeout
 from servobus.rpc.errors import decoded
 from servobus.rpc.methods import MAX_LINE, METHODS
+from servobus.values import Role
 
 MAX_REPLY = 4 * 1024 * 1024  # bytes of one line from the daemon
 MAX_WAITING = 1024  # calls of one connection that wait for their replies
@@ -41,6 +42,11 @@ class _PendingCall:
     overdue: asyncio.TimerHandle
     then: Callable[[Any], Any] | None
     """Called with the result the moment it comes, before anything that follows it is read; its value is the reply."""
+
+
+def _changes(method: str) -> bool:
+    """Return whether a call of this method asks for a change."""
+    return METHODS[method].role > Role.OBSERVER or method == "stop"
 
 
 def _plain(value: Any) -> Any:
@@ -190,7 +196,8 @@ class DaemonConnection(asyncio.Protocol):
     def _overdue(self, number: int) -> None:
         call = self._calls[number]
         if not call.reply.done():
-            message = f"the daemon did not answer {call.method} within {call.timeout:g} s: it may have been applied"
+            applied = ": it may have been applied" if _changes(call.method) else ""
+            message = f"the daemon did not answer {call.method} within {call.timeout:g} s{applied}"
             call.reply.set_exception(ReplyTimeout(message))
             self.notify("cancel", {"call": number})  # what has not begun yet must not begin later
 
@@ -206,7 +213,8 @@ class DaemonConnection(asyncio.Protocol):
         self.down = LinkDown(f"{self.address}: {why}")
         for call in self._calls.values():
             if not call.reply.done():
-                call.reply.set_exception(LinkDown(f"{self.down.message}; {call.method} was under way and may have been applied"))
+                applied = " and may have been applied" if _changes(call.method) else ""
+                call.reply.set_exception(LinkDown(f"{self.down.message}; {call.method} was under way{applied}"))
         self._transport.abort()
 
     def close(self) -> None:

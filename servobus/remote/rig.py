@@ -166,6 +166,11 @@ class RemoteRig(Rig):
             connection.call("stats", {}, timeout=DEADLINE, then=self._cache.put_stats),
         )
 
+    @property
+    def connected(self) -> bool:
+        """The connection to the daemon is up."""
+        return self._cache.down is None
+
     def _changed(self, lost: LinkDown | None) -> None:
         """The connection is up (None), or is lost for this reason."""
         before, self._cache.down = self._cache.down, lost

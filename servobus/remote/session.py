@@ -83,7 +83,7 @@ class Session:
         try:
             greeting: Greeting = await connection.call("hello", hello | {"protocol": PROTOCOL}, timeout=GREETING_TIMEOUT)
         except LinkDown as error:
-            raise LinkDown(error.message.removesuffix("; hello was under way and may have been applied")) from None
+            raise LinkDown(error.message.removesuffix("; hello was under way")) from None
         except ReplyTimeout:
             raise LinkDown(
                 f"{self.address} does not say within {GREETING_TIMEOUT:g} s who it is: is it a servobus daemon?"

@@ -122,6 +122,25 @@ def test_a_daemon_does_not_listen_at_a_tcp_address_of_the_environment(
     assert "a daemon listens at a path" in capsys.readouterr().err
 
 
+def test_a_named_daemon_and_a_config_of_another_rig_are_not_guessed_between(tmp_path: Path) -> None:
+    """Both were named, and a command for one of them must not reach the other."""
+    other = tmp_path / "other.yaml"
+    other.write_text(LIMP.replace("arm:", "leg:"))
+    there = str(tmp_path / "d" / "s.sock")
+    with servobus("run", "servobus.yaml", SERVOBUS_SOCKET=there) as daemon:
+        until(daemon, "running")
+        for verb in (("move", "shoulder=5"), ("enable",), ("read",)):
+            with servobus(*verb, "--trace", SERVOBUS_SOCKET=there, SERVOBUS_CONFIG=str(other)) as process:
+                out, err = process.communicate(timeout=30)
+                assert (process.returncode, out) == (2, "")
+                assert "which of the two is meant?" in err
+                assert " > " not in err, "no frame left"
+        with servobus("read", "--json", SERVOBUS_SOCKET=there, SERVOBUS_CONFIG="servobus.yaml") as process:
+            assert set(json.loads(process.communicate(timeout=30)[0])) == {"arm/shoulder", "arm/elbow"}
+        daemon.terminate()
+        assert daemon.wait(10) == 0
+
+
 @pytest.mark.slow
 def test_every_verb_reaches_a_daemon_that_is_named_by_its_tcp_address(tmp_path: Path) -> None:
     token, config = tmp_path / "token", tmp_path / "tcp.yaml"

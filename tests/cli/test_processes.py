@@ -113,6 +113,25 @@ def test_clear_names_the_stops_that_are_owed(rig: str, tmp_path: Path) -> None:
             assert daemon.wait(10) == 0
 
 
+def test_a_move_whose_daemon_was_killed_does_not_say_that_it_keeps_the_servo(rig: str) -> None:
+    with servobus("run", rig) as daemon:
+        until(daemon, "running")
+        with servobus("enable") as enabling:
+            assert enabling.wait(20) == 0
+        with servobus("move", "shoulder=90", "--speed", "1", "--json") as moving:
+            with servobus("monitor", "--json", "shoulder") as monitor:
+                assert monitor.stdout is not None
+                while json.loads(monitor.stdout.readline())["arm/shoulder"]["position"] < 0.2:
+                    pass
+            daemon.kill()
+            out, err = moving.communicate(timeout=20)
+        assert moving.returncode == 1
+        assert "may have been applied" not in err
+        left = json.loads(out)["left"]["arm/shoulder"]
+        assert left["confirmed"] is False
+        assert "the connection to the daemon is lost" in left["detail"]
+
+
 def test_the_commands_talk_to_the_daemon(rig: str) -> None:
     """Enable, move, stop and clear by processes of their own, each without a config."""
     with servobus("run", rig) as daemon:

@@ -8,7 +8,7 @@ from servobus.engine.job import Callback, Job
 from servobus.engine.queue import RequestQueue, overloaded
 from servobus.errors import LinkDown, Overloaded, ReplyTimeout
 from servobus.protocols.base import Plan
-from tests.engine.toy_protocol import Sink, read
+from tests.engine.toy_protocol import Sink, read, write
 
 
 def job(node: int, register: int = 0, *, expires: float = 1.0, session: object = None) -> Job:
@@ -107,11 +107,12 @@ def test_a_job_waits_until_it_expires_and_not_at_it() -> None:
 
 
 def test_a_job_that_was_sent_already_says_so_when_it_expires() -> None:
-    sent = job(1)
-    sent.attempts = 1
-    queue = queue_of(sent)
-    assert queue.take(1.0) is None
-    assert "may have been applied" in str(sink(sent).results[0])
+    for request, applied in ((read(1), False), (write(1, 5), True)):
+        sent = Job(Sink(), 1.0, request=request)
+        sent.attempts = 1
+        assert queue_of(sent).take(1.0) is None
+        assert "no reply" in str(sink(sent).results[0])
+        assert ("may have been applied" in str(sink(sent).results[0])) == applied
 
 
 def test_expire_fails_what_stands_first_and_is_too_old() -> None:

@@ -94,6 +94,7 @@ class ToyRequest(Request[Any]):
         self.nodes = (() if node == ALL else (node,)) if nodes is None else nodes
         self.replies = len(self.nodes)
         self.reply_size = 6
+        self.changes = payload[0] == WRITE
         self.reply_key = (payload[0] | ANSWER, *payload[1:]) if payload[0] == PING else payload[0] | ANSWER
         for name, value in traits.items():
             setattr(self, name, value)

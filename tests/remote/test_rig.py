@@ -184,7 +184,7 @@ async def test_a_daemon_that_hangs_costs_a_call_its_deadline(tmp_path: Path) -> 
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         daemon.answers["ping"] = lambda _, message: asked.append(message["id"])
         talk = asyncio.create_task(alive(daemon, 60))
-        with pytest.raises(ReplyTimeout, match="ping within 10 s: it may have been applied"):
+        with pytest.raises(ReplyTimeout, match=r"ping within 10 s$"):
             await rig.ping("s1")
         daemon.visitor.say({"id": asked[0], "result": 3})  # nobody waits for it any more
         daemon.answers["ping"] = {"result": 4}
@@ -196,7 +196,7 @@ async def test_a_daemon_that_hangs_costs_a_call_its_deadline(tmp_path: Path) -> 
 async def test_a_silent_daemon_is_a_lost_one(tmp_path: Path) -> None:
     async with puppet_daemon(tmp_path / "s") as daemon, connect(tmp_path / "s") as rig:
         daemon.answers["ping"] = lambda *_: None
-        with pytest.raises(LinkDown, match=f"silent for {SILENCE:g} s; ping was under way and may have been applied"):
+        with pytest.raises(LinkDown, match=f"silent for {SILENCE:g} s; ping was under way$"):
             await rig.ping("s1")
         await until(lambda: len(daemon.visitors) == 2)
 

@@ -84,6 +84,8 @@ class KstRequest(Request[R]):
 class Read(KstRequest[R]):
     """Read id, position, status or version (KST RS422, 3.4, 3.6 to 3.8)."""
 
+    changes = False
+
     def __init__(
         self, settings: RequestSettings, node: int, command: Command, make: Callable[[bytes], R], *, once: bool = False
     ) -> None:
@@ -102,6 +104,7 @@ class Fence(KstRequest[None]):
     It is not repeated: the next fence needs another command, or this one's late reply could answer it.
     """
 
+    changes = False
     idempotent = False
 
     def __init__(self, settings: RequestSettings, node: int, command: Command, ids: Collection[int]) -> None:

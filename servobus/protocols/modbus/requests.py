@@ -106,6 +106,8 @@ class ModbusRequest(Request[R]):
 class ReadHolding(ModbusRequest[R]):
     """0x03: reads `count` registers from `address` on."""
 
+    changes = False
+
     def __init__(self, timing: RtuTiming, unit: int, address: int, count: int, make: Callable[[Sequence[int]], R]) -> None:
         """`make`: returns the request's value for the registers. Raises ValueError outside 1 to 125 registers."""
         if unit == BROADCAST or not 1 <= count <= MAX_READ:

@@ -237,10 +237,12 @@ class Hand:
             return error
         if not code:
             return error
-        meaning = SUB_EXCEPTIONS.get(code, "a sub-exception that is not documented")
+        meaning = f"{SUB_EXCEPTIONS.get(code, 'a sub-exception that is not documented')} ({code})"
+        if error.message.endswith(meaning):
+            return error  # a step of the same plan has asked already
         qualifier = "" if error.code == DEVICE_FAILURE else "its last sub-exception: "
         return DeviceError(
-            f"{error.message}; {qualifier}{meaning} ({code})",
+            f"{error.message}; {qualifier}{meaning}",
             code=error.code,
             request=error.request,
             raw=error.raw,

@@ -43,6 +43,8 @@ class SmsRequest(Request[R]):
 class Ping(SmsRequest[int | None]):
     """PING (SMS 1.0, 1.3.1): returns the health byte. Any servo answers the broadcast id, so only one may be on the line."""
 
+    changes = False
+
     def __init__(self, node: int) -> None:
         super().__init__(node, Instruction.PING)
 
@@ -60,6 +62,8 @@ class Ping(SmsRequest[int | None]):
 class PingById(SmsRequest[int | None]):
     """READ of the id register, for its health byte."""
 
+    changes = False
+
     def __init__(self, node: int) -> None:
         super().__init__(node, Instruction.READ, bytes((ID_ADDRESS, 1)), size=1)
 
@@ -71,6 +75,7 @@ class Read(SmsRequest[R]):
     """READ DATA (SMS 1.0, 1.3.2) of `size` bytes from `address`; `decode` turns them into the value."""
 
     __slots__ = ("_prefix", "address", "decode")
+    changes = False
 
     def __init__(self, node: int, address: int, size: int, decode: Callable[[bytes], R]) -> None:
         super().__init__(node, Instruction.READ, bytes((address, size)), size=size)
@@ -211,6 +216,7 @@ class SyncRead(SmsRequest[R]):
     """SYNC READ (FEETECH, newer than SMS 1.0): one reply per servo, in the order asked. A missing reply spoils no other."""
 
     __slots__ = ("decode",)
+    changes = False
     partial = True
 
     def __init__(self, address: int, size: int, nodes: Sequence[int], decode: Callable[[Mapping[int, bytes]], R]) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from servobus.bus.service import BusService
-from servobus.errors import ServobusError
+from servobus.errors import DeviceError, ServobusError
 from servobus.protocols.kst.codec import Command, decode_position
 from servobus.protocols.kst.simulated.device import KstDevice
 from servobus.values import Goal, Health
@@ -205,3 +205,43 @@ def test_a_stop_reaches_a_servo_that_is_heard_later(poll: dict[str, float], faul
             assert not bus.stops.owed
 
     run()
+
+
+@virtual
+async def test_settle_tells_why_a_motion_was_cut() -> None:
+    async with running() as (bus, servos, events):
+        await bus.motion.enable("pan")
+        await bus.motion.send("pan", Goal("position", 80.0), confirm=False)
+        await asyncio.sleep(0.2)
+        servos[0].refuses[Command.SET_POSITION] = 0x06090030
+        with pytest.raises(DeviceError, match="0609 0030"):
+            await bus.motion.settle("pan", tolerance=None, timeout=10)
+        assert events.count("motion_cut") == 1
+        del servos[0].refuses[Command.SET_POSITION]
+        await bus.motion.send("pan", Goal("position", 20.0), confirm=False)
+        assert (await bus.motion.settle("pan", tolerance=0, timeout=10)).position == 20
+
+
+@BY_POLLS
+def test_a_servo_that_does_not_say_whether_it_moves_has_settled_when_it_rests(poll: dict[str, float]) -> None:
+    """A short way is inside the tolerance from the beginning."""
+
+    @virtual
+    async def run() -> None:
+        async with running(poll=poll) as (bus, _, _):
+            await bus.motion.enable("pan")
+            await bus.motion.send("pan", Goal("position", 1.0), confirm=False)
+            assert (await bus.motion.settle("pan", tolerance=None, timeout=5)).position == 1
+
+    run()
+
+
+@virtual
+async def test_a_poll_without_the_position_makes_no_position_fresh() -> None:
+    async with running(poll={"health": 50}) as (bus, servos, _):
+        servos[0].goal = 300
+        await asyncio.sleep(1)
+        age = bus.state("pan").age
+        assert age is not None
+        assert age > 0.5
+        assert (await bus.read("pan", max_age=0.2)).position == 30

@@ -225,8 +225,9 @@ def test_enable_believes_no_single_position() -> None:
 def test_a_hand_that_is_not_ready_is_not_enabled(state: str, reason: str) -> None:
     bench = Bench()
     bench.hand.state, bench.hand._ready = state, 99.0
-    with pytest.raises(DeviceError, match=reason):
+    with pytest.raises(DeviceError, match=reason) as refused:
         bench.run(bench.driver.enable("index"))
+    assert str(refused.value).count(reason) == 1
     assert bench.hand.written == []
 
 
