@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from servobus.protocols.model import Register
-from servobus.protocols.sms.servo import UNKNOWN, HostServo
+from servobus.protocols.sms.identity import UNKNOWN
+from servobus.protocols.sms.servo import HostServo
 from servobus.values import StopReport, StopTarget
 
 ROUNDS = 4
@@ -59,14 +60,14 @@ class Stop:
 
     def blind(self) -> Writes | None:
         """Return what may be written for ever to a servo that does not answer: never a position."""
-        if self.target.kind == "limp":
+        if self._goes_limp:
             return self._torque_off
         return self._rest_of(self._mode(None))
 
     def estimate(self) -> Writes | None:
         """Return the estimate of the present position as a goal, once, for a servo that was energised when it was last heard."""
         target, servo = self.target, self.servo
-        if self._blind or not target.enabled or target.position is None or servo.fit.mode != "position":
+        if self._blind or self._goes_limp or not target.enabled or target.position is None or servo.fit.mode != "position":
             return None
         raw = servo.calibration.to_raw(target.position)
         low, high = servo.position.raw_range
@@ -97,7 +98,7 @@ class Stop:
         """Whether another mode than known, or torque 0 where it was on, was read once only."""
         *others, last = map(self._state_of, self._readings)
         expected = [(self._mode(None), True)]
-        if not (self.target.enabled or self.target.energised) or "limp" in (self.target.kind, self.report.action):
+        if not (self.target.enabled or self.target.energised) or self._goes_limp:
             expected.append((self._mode(None), False))
         return last not in (*expected, *others)
 
@@ -116,7 +117,7 @@ class Stop:
     def next_write(self, number: int) -> Writes | None:
         """Return what this round writes after it has read; None: nothing. The report says what is confirmed."""
         if not self._readings:
-            return self._written(self.estimate())
+            return self._written(self._torque_off if self._goes_limp else self.estimate())
         odd, readings, self._readings = self._is_odd, self._readings, []
         if odd:
             return self._report(self.report.action, confirmed=False, detail="mode and torque read differently each time")
@@ -125,7 +126,7 @@ class Stop:
         return self._written(self._rule(readings[-1], before, positions, number))
 
     def _rule(self, motion: Registers, before: Registers | None, positions: list[int], number: int) -> Writes | None:
-        if self.target.kind == "limp" or self.report.action == "limp":
+        if self._goes_limp:
             return self._limp(motion, "torque still reads on")
         if not motion[self.servo.model.torque]:
             return self._report("none", confirmed=True, detail=self._why_limp(motion))
@@ -154,18 +155,13 @@ class Stop:
         return self._torque_off
 
     def _hold(self, motion: Registers, positions: list[int]) -> Writes | None:
-        """Goal := present, until the goal reads so and the joint is there.
-
-        Torque 0 where the joint is outside its stored limits: whatever its goal is, the servo drives it to them.
-        """
+        """Goal := present, until the goal reads so and the joint is there."""
         register, present = self.servo.position, motion[self.servo.model.state["position"]]
-        low, high = self.servo.fit.raw_limits or register.raw_range
-        if not low - NEAR <= present <= high + NEAR:
-            return self._limp(motion, self._why_outside(present))
         if self._goal is not None and motion[register.name] == self._goal and abs(present - self._goal) <= NEAR:
             return self._report("hold", confirmed=True)
         detail = "" if self._goal is None else f"{register.name} does not read back, or the joint is not there"
         self._report("hold", confirmed=False, detail=detail)
+        low, high = register.raw_range
         self._goal = max(low, min(high, sorted(positions)[1] if len(positions) > 2 else present))
         return register, self._goal
 
@@ -181,6 +177,11 @@ class Stop:
         return self._limp(motion, "it did not rest in step mode: torque was switched off")
 
     # Parts
+
+    @property
+    def _goes_limp(self) -> bool:
+        """Whether torque off is wanted, or has been written in this stop: no position may switch it on again."""
+        return "limp" in (self.target.kind, self.report.action)
 
     @property
     def _torque_off(self) -> Writes:
@@ -225,13 +226,6 @@ class Stop:
             "it was not identified" if mode == UNKNOWN else f"it is in {mode}, which its model does not know"
         )
         return f"its torque was switched off, because it cannot be held: {reason}"
-
-    def _why_outside(self, present: int) -> str:
-        (low, high), at = self.servo.limits or (0.0, 0.0), self.servo.calibration.to_unit(present)
-        return (
-            f"its torque was switched off, because it cannot be held: it is at {at:.4g}, outside its own stored limits "
-            f"{low:.4g} to {high:.4g}"
-        )
 
     def _written(self, write: Writes | None) -> Writes | None:
         if write is not None and not self.report.written:
