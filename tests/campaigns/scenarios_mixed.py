@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field
+from typing import Any
 
 from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig
@@ -152,7 +153,7 @@ class Mixed:
         self.servo(self.rng.choice(NAMES)).loss = self.rng.choice([0.0, 0.0, 0.2])
 
 
-Step = Callable[[Mixed], Awaitable[None]]
+Step = Callable[[Mixed], Coroutine[Any, Any, None]]
 VERBS: list[Step] = [Mixed.enable] * 4 + [Mixed.move] * 6 + [Mixed.clear] * 3 + [Mixed.disable, Mixed.read]
 TROUBLES: list[Step] = [Mixed.stop, Mixed.abandon, Mixed.deaf, Mixed.mute, Mixed.lossy]
 STEPS_OF: dict[str, list[Step]] = {

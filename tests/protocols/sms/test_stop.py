@@ -130,68 +130,6 @@ def test_a_hold_is_what_was_just_read_and_never_an_estimate(family: str) -> None
     assert travel(bench, bench.devices[1]) == 0
 
 
-@pytest.mark.parametrize("estimate", [0.0, None])
-@pytest.mark.parametrize("family", FAMILIES)
-def test_one_altered_position_is_not_held(family: str, estimate: float | None) -> None:
-    """Its checksum is right, so only another reading can tell."""
-    bench = Bench({"a": {"id": 1, "model": family}})
-    bench.enable()
-    device = bench.devices[1]
-    position, altered = device.joint.position, [900.0]
-
-    def once(packet: Packet) -> bool:
-        device.joint.position = altered.pop() if altered and packet.code != Instruction.SYNC_WRITE else position
-        return False
-
-    bench.is_lost = once
-    report = stop(bench, target("a", position=estimate))["a"]
-    assert report.confirmed
-    assert not altered
-    written = [packet.params for packet in bench.sent if packet.code == Instruction.SYNC_WRITE]
-    register = device.memory.registers["goal_position"]
-    assert {register.decode(params[3:5], device.model.byte_order) for params in written} == {round(position)}
-
-
-@pytest.mark.parametrize("enabled", [True, False])
-@pytest.mark.parametrize("altered", ["torque", "mode"])
-@pytest.mark.parametrize(("family", "mode"), MODES)
-def test_one_altered_reading_confirms_no_stop(family: str, mode: str, altered: str, *, enabled: bool) -> None:
-    """Torque reads 0, or the mode reads as another, once, with a right checksum."""
-    bench = Bench({"a": {"id": 1, "model": family}})
-    device = moving(bench, mode)
-    bench.run(bench.driver.identify("a"))
-    bench.now = 0.5
-    address = device.model.registers[{"torque": "torque_enable", "mode": device.model.mode_registers[0]}[altered]].address
-    right, reads = device.memory.data[address], [1]
-
-    def once(packet: Packet) -> bool:
-        first = packet.code == Instruction.READ and bool(reads and reads.pop())
-        device.memory.data[address] = (0 if altered == "torque" else 2 if right != 2 else 0) if first else right
-        return False
-
-    bench.is_lost = once
-    report = stop(bench, target("a", enabled=enabled, energised=True, position=0.0))["a"]
-    assert not reads
-    assert (report.action, report.confirmed) == ("hold", True), report
-    assert travel(bench, device) == 0
-    assert bench.register(1, "torque_enable") == 1
-
-
-def test_readings_that_differ_each_time_confirm_no_stop() -> None:
-    bench = Bench({"a": {"id": 1, "model": "sts"}})
-    device = moving(bench, "position")
-    bench.run(bench.driver.identify("a"))
-
-    def noise(packet: Packet) -> bool:
-        device.memory.data[33] = len(bench.sent) % 4 + 1
-        return False
-
-    bench.is_lost = noise
-    report = stop(bench, target("a"))["a"]
-    assert not report.confirmed
-    assert report.detail == "mode and torque read differently each time"
-
-
 def test_a_round_reads_anew_and_repeats_no_old_position() -> None:
     bench = Bench()
     bench.enable("a")
@@ -286,16 +224,6 @@ def test_an_offline_servo_is_written_to_without_waiting() -> None:
     assert bench.instructions() == ["SYNC_WRITE"] * 4
     assert reports["a"] == StopReport("hold", True, False, "offline: nothing was confirmed")
     assert reports["b"].written
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_silent_servo_that_goes_limp_gets_no_position(family: str) -> None:
-    bench = Bench({"a": {"id": 1, "model": family}})
-    bench.enable()
-    bench.is_unanswered = lambda packet: packet.code == Instruction.READ
-    report = stop(bench, target("a", "limp", position=0.0))["a"]
-    assert (report.action, report.written, report.confirmed) == ("limp", True, False)
-    assert bench.register(1, "torque_enable") == 0
 
 
 @pytest.mark.parametrize("family", FAMILIES)
