@@ -154,7 +154,7 @@ class Mixed:
 
 
 Step = Callable[[Mixed], Coroutine[Any, Any, None]]
-VERBS: list[Step] = [Mixed.enable] * 4 + [Mixed.move] * 6 + [Mixed.clear] * 3 + [Mixed.disable, Mixed.read]
+VERBS: list[Step] = [*[Mixed.enable] * 4, *[Mixed.move] * 6, *[Mixed.clear] * 3, Mixed.disable, Mixed.read]
 TROUBLES: list[Step] = [Mixed.stop, Mixed.abandon, Mixed.deaf, Mixed.mute, Mixed.lossy]
 STEPS_OF: dict[str, list[Step]] = {
     "sms": [*VERBS, *TROUBLES, *[Mixed.move_together] * 3, Mixed.power_off, Mixed.protection],
