@@ -20,7 +20,7 @@ from servobus.errors import ServobusError
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Action, Read, RegWrite
-from servobus.protocols.sms.servo import HostServo
+from servobus.protocols.sms.servo import UNKNOWN, HostServo
 
 FLAG_ADDRESS = 64
 """The same in every FEETECH memory table: 1 while a REG WRITE waits for ACTION."""
@@ -90,10 +90,14 @@ class Armed:
                 yield from self._obstacle(node)
 
     def disarm(self, servo: HostServo) -> Plan[bool]:
-        """Let the servo fire a write that moves nothing: EEPROM is locked. Return whether its flag was read as 0 then."""
-        lock = servo.model.registers[servo.model.lock]
-        answered = self.options.writes_answered
-        harmless = RegWrite(servo.node, lock.address, servo.encode(lock, 1), answered=answered)
+        """Let the servo fire a write that moves nothing. Return whether its flag was read as 0 then.
+
+        EEPROM is locked; where it has another memory table than its model, torque 0, whose address is the same in every table.
+        """
+        model, answered = servo.model, self.options.writes_answered
+        name, raw = (model.torque, 0) if servo.fit.mode == UNKNOWN else (model.lock, 1)
+        register = model.registers[name]
+        harmless = RegWrite(servo.node, register.address, servo.encode(register, raw), answered=answered)
         try:
             for _ in range(1 if answered else BLIND_REPEATS):
                 yield from ask(harmless)

@@ -16,12 +16,10 @@ from servobus.protocols.sms.armed import Armed
 from servobus.protocols.sms.model import LIMITS, SmsModel, packaged_models
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Read
-from servobus.protocols.sms.servo import Fit, HostServo
+from servobus.protocols.sms.servo import UNKNOWN, Fit, HostServo
 from servobus.values import Identity
 
 VERSION_SIZE = 5
-UNKNOWN = "unknown"
-"""The mode of a servo whose memory table is not known."""
 ARMED_NOTE = (
     "a REG WRITE of an earlier program waits in it: an ACTION would carry it out. Enable or disable it, which disarms it, or "
     "switch its power off and on"

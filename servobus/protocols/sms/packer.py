@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
-from servobus.errors import NotSupported
+from servobus.errors import LimitError, NotSupported
 from servobus.protocols.model import Register
 from servobus.protocols.sms.servo import Fit, HostServo
 from servobus.protocols.speed import default_speed, duration_speed, goal_speed
@@ -170,7 +170,10 @@ class GoalPacker:
         return position, self._time(time), self._speed(speed)
 
     def _velocity_values(self, goal: Goal) -> tuple[int, ...]:
-        return (self._speed(self.servo.to_raw(self.servo.speed, goal.value)),)
+        raw = self.servo.to_raw(self.servo.speed, goal.value)
+        if not raw and goal.value:
+            raise self._too_slow("velocity", goal.value)
+        return (self._speed(raw),)
 
     def _time_and_speed(self, goal: ServoGoal) -> tuple[int, int]:
         """Raw time and speed of a position goal: the time rules only where the model has one and a duration is given."""
@@ -183,7 +186,17 @@ class GoalPacker:
         if goal.goal.speed is None:
             return self.rest_time, self.default_speed
         speed = goal_speed(goal, self.servo.options, 0.0)
+        is_coarse = (self.servo.fit.speed_scale or 1) > 1  # one step/s too much is none
+        if speed and is_coarse and not self.servo.to_raw(self.servo.speed, speed):
+            raise self._too_slow("speed", speed)
         return self.rest_time, self._raw_speed(speed) if speed else 0
+
+    def _too_slow(self, what: str, value: float) -> LimitError:
+        slowest = abs(self.servo.to_physical(self.servo.speed, 1))
+        return LimitError(
+            f"{what} {value:g} is slower than the servo can be told: its slowest is {slowest:.3g}; nothing was sent",
+            servo=self.servo.name,
+        )
 
     def _raw_speed(self, speed: float) -> int:
         """At least 1, because 0 means no limit on the wire."""

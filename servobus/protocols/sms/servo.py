@@ -24,13 +24,17 @@ CALIBRATED_UNITS = frozenset({"position", "speed", "acceleration"})
 """Units of registers that the servo's calibration turns into its own unit."""
 
 
+UNKNOWN = "unknown"
+"""The mode of a servo whose memory table is not that of its model."""
+
+
 @dataclass(frozen=True, slots=True)
 class Fit:
     """What a servo reported about its own settings. It is replaced as a whole, never changed. The default is a servo that was not
     asked yet: it may be previewed, and is neither enabled nor held."""
 
     mode: str = "position"
-    """A mode of its model, or "mode N"; "unknown" where its memory table is not its model's."""
+    """A mode of its model, "mode N", or UNKNOWN."""
     raw_limits: tuple[int, int] | None = None
     """Its stored limits in raw steps; None: it has none."""
     response_level: int | None = None

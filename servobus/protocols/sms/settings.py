@@ -15,7 +15,7 @@ from servobus.protocols.model import Register
 from servobus.protocols.sms.identity import learn
 from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Write
-from servobus.protocols.sms.servo import HostServo
+from servobus.protocols.sms.servo import UNKNOWN, HostServo
 
 COMMISSIONING = frozenset({"id", "baud_rate", "response_status_level"})
 """Registers whose change makes the config untrue, so that the servo is lost."""
@@ -41,6 +41,8 @@ class SettingWriter:
         return self._plan(servo, register, data, count, raw=raw)
 
     def _plan(self, servo: HostServo, register: Register, data: bytes, count: int, *, raw: bool) -> Plan[Any]:
+        if servo.fit.mode == UNKNOWN:
+            raise NotSupported(f"register {register.name} is not written: {servo.fit.obstacle}", servo=servo.name)
         if register.memory == "eeprom":
             yield from self._write_eeprom(servo, register, data)
         else:

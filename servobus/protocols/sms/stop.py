@@ -5,6 +5,7 @@
 | limp, whatever the mode | torque 0 | torque reads 0 |
 | hold, torque reads 0 | nothing: a hold never energises | at once |
 | hold, position | goal := the present position just read | goal reads so, and the joint is there |
+| hold, position, outside its stored limits | torque 0 | torque reads 0 |
 | hold, velocity | speed 0 | the goal speed reads 0 |
 | hold, pwm or motor | PWM word 0 | the word reads 0 |
 | hold, step | 0 steps to go | two readings of the position are equal; torque 0 where they are not |

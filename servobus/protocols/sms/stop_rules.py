@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from servobus.protocols.model import Register
-from servobus.protocols.sms.identity import UNKNOWN
-from servobus.protocols.sms.servo import HostServo
+from servobus.protocols.sms.servo import UNKNOWN, HostServo
 from servobus.values import StopReport, StopTarget
 
 ROUNDS = 4
@@ -155,13 +154,18 @@ class Stop:
         return self._torque_off
 
     def _hold(self, motion: Registers, positions: list[int]) -> Writes | None:
-        """Goal := present, until the goal reads so and the joint is there."""
+        """Goal := present, until the goal reads so and the joint is there.
+
+        Torque 0 where the joint is outside its stored limits: whatever its goal is, the servo drives it to them.
+        """
         register, present = self.servo.position, motion[self.servo.model.state["position"]]
+        low, high = self.servo.fit.raw_limits or register.raw_range
+        if not low - NEAR <= present <= high + NEAR:
+            return self._limp(motion, self._why_outside(present))
         if self._goal is not None and motion[register.name] == self._goal and abs(present - self._goal) <= NEAR:
             return self._report("hold", confirmed=True)
         detail = "" if self._goal is None else f"{register.name} does not read back, or the joint is not there"
         self._report("hold", confirmed=False, detail=detail)
-        low, high = register.raw_range
         self._goal = max(low, min(high, sorted(positions)[1] if len(positions) > 2 else present))
         return register, self._goal
 
@@ -226,6 +230,13 @@ class Stop:
             "it was not identified" if mode == UNKNOWN else f"it is in {mode}, which its model does not know"
         )
         return f"its torque was switched off, because it cannot be held: {reason}"
+
+    def _why_outside(self, present: int) -> str:
+        (low, high), at = self.servo.limits or (0.0, 0.0), self.servo.calibration.to_unit(present)
+        return (
+            f"its torque was switched off, because it cannot be held: it is at {at:.4g}, outside its own stored limits "
+            f"{low:.4g} to {high:.4g}"
+        )
 
     def _written(self, write: Writes | None) -> Writes | None:
         if write is not None and not self.report.written:

@@ -127,6 +127,20 @@ def test_a_node_in_doubt_that_does_not_answer_withholds_action(family: str) -> N
     assert bench.move(GOALS, confirm=True) == ACKED
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_servo_of_another_family_is_disarmed_by_what_all_tables_share(family: str) -> None:
+    """The address of the lock differs by family; that of torque does not (FEETECH memory tables, address 40)."""
+    bench = bench_of(family)
+    arm(bench.devices[3])
+    bench.devices[3].pose_as(0, 10, 5)
+    bench.run(bench.driver.identify("c"))
+    bench.sent.clear()
+    bench.run(bench.driver.disable("c"))
+    assert bench.register(3, "async_write_flag") == 0
+    assert travel(bench, bench.devices[3]) == 0
+    assert {packet.params[0] for packet in bench.sent if packet.code in (Instruction.WRITE, Instruction.REG_WRITE)} == {40}
+
+
 # What we armed ourselves
 
 

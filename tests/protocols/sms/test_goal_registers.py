@@ -30,6 +30,22 @@ def test_position_time_and_speed(goal: Goal, values: tuple[int, int, int]) -> No
     assert tuple(int.from_bytes(data[at : at + 2], "little") for at in (0, 2, 4)) == values
 
 
+@pytest.mark.parametrize("model", ["sts", "sms", "sms_cl"])
+def test_a_speed_that_the_servo_cannot_be_told_is_refused(model: str) -> None:
+    """FEETECH memory table, 18: while bit 2 is 0 a count is 50 steps/s. So 20 would be rest, or twice as fast."""
+    for mode, goal in ((1, Goal("velocity", -20)), (0, Goal("position", 100, speed=20))):
+        bench = Bench({"a": {"id": 1, "model": model, "unit": "step"}})
+        for name, raw in (("phase", 8), ("mode", mode)):
+            bench.devices[1].memory.store(bench.devices[1].memory.registers[name], raw)
+        bench.enable()
+        with pytest.raises(LimitError, match="slower than the servo can be told: its slowest is 50"):
+            bench.move({"a": goal})
+        assert not bench.sent
+        bench.move({"a": Goal("velocity", 0) if mode else Goal("position", 100, duration=60)})
+        bench.move({"a": Goal(goal.kind, 30, speed=None if mode else 30)})
+        assert bench.register(1, "goal_speed") == 1
+
+
 def test_an_scs_takes_a_time() -> None:
     bench = Bench({"s": {"id": 1, "model": "scs"}})
     bench.enable()

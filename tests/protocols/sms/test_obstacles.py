@@ -196,3 +196,24 @@ def test_a_mode_written_by_hand_counts_at_once(family: str) -> None:
     bench.driver.check_goal(ServoGoal("a", Goal("velocity", 1.0)))
     with pytest.raises(NotSupported, match=re.escape("velocity mode")):
         bench.driver.check_goal(ServoGoal("a", Goal("position", 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("end", "major", "minor", "family"), [(0, 9, 3, "sts"), (0, 8, 44, "sms"), (1, 5, 15, "scs"), (0, 10, 5, None)]
+)
+@pytest.mark.parametrize("configured", FAMILIES)
+def test_no_register_is_written_by_name_where_another_table_is(
+    configured: str, end: int, major: int, minor: int, family: str | None
+) -> None:
+    """The name would mean another register: the lock of SCS (48) is the torque limit of STS."""
+    bench = Bench({"a": {"id": 1, "model": configured}})
+    bench.devices[1].pose_as(end, major, minor)
+    identity_of(bench)
+    bench.sent.clear()
+    plan = bench.driver.write_register("a", "min_angle_limit", 10.0, persist=True)
+    if configured == family:
+        bench.run(plan)
+        return
+    with pytest.raises(NotSupported, match="is not written: "):
+        bench.run(plan)
+    assert not bench.sent
