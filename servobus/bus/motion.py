@@ -157,9 +157,15 @@ class Motion:
     # Enable and disable
 
     async def enable(self, servo: str) -> None:
-        """Set the goal to the present position, then switch torque on. Raises EStopped, Busy, NotEnabled, DeviceError."""
+        """Set the goal to the present position, then switch torque on. Raises EStopped, Busy, NotEnabled, DeviceError.
+
+        A servo that is enabled and on its way is held first: where its driver refuses a servo that moves, it would travel on.
+        """
         self.refuse()
         record = self._parts.records[servo]
+        if record.enabled and not record.arrived(self._near(servo)):
+            await self._stops.hold([servo])
+            self.refuse()
         generation = record.generation
         self.enabling.add(servo)
         try:

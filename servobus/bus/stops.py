@@ -71,6 +71,11 @@ class Stops:
         cut = EStopped("the e-stop came before the servo arrived at its goal")
         return await self._stop(lambda record: record.options.on_estop, list(self._parts.records.values()), cut)
 
+    async def hold(self, servos: Sequence[str]) -> dict[str, StopReport]:
+        """Hold these servos, ahead of everything that waits."""
+        records = [self._parts.records[servo] for servo in servos]
+        return await self._stop(lambda _: "hold", records, NotEnabled("the servo was enabled anew before it arrived at its goal"))
+
     async def limp(self, servos: Sequence[str]) -> dict[str, StopReport]:
         """Switch torque off for these servos, ahead of everything that waits."""
         records = [self._parts.records[servo] for servo in servos]

@@ -147,3 +147,19 @@ async def test_a_servo_that_had_arrived_was_not_cut_short_by_a_stop() -> None:
         await rig.stop()
         await rig.clear()
         assert (await rig.settle("s1"))["arm/s1"].position == pytest.approx(10, abs=0.9)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@virtual
+async def test_a_servo_that_is_enabled_anew_on_its_way_is_held(protocol: str) -> None:
+    async with open_rig(rig_config(protocol)) as rig:
+        await rig.enable("s1")
+        await rig["s1"].move_to(60)
+        await asyncio.sleep(0.3)
+        await rig.enable("s1")
+        before = (await rig.read("s1")).position
+        await asyncio.sleep(0.5)
+        assert (await rig.read("s1")).position == pytest.approx(before, abs=0.5)
+        assert rig.state("s1").enabled
+        await rig["s1"].move_to(70)
+        assert (await rig.settle("s1"))["arm/s1"].position == pytest.approx(70, abs=1)
