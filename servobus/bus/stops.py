@@ -189,7 +189,7 @@ class Stops:
         self._paying.update(target.servo for target in targets)
         sink = Callback(partial(self._stopped_again, targets))
         plan = self._parts.driver.stop(targets)
-        self._parts.scheduler.put_stop(Job(sink, math.inf, plan=plan, node=records[0].node.id, kind=self._kind, tries=1))
+        self._parts.scheduler.put_stop(Job(sink, math.inf, plan=plan, node=records[0].node.id, kind=self._kind))
         self._parts.scheduler.wanted()
 
     def _stopped_again(self, targets: Sequence[StopTarget], result: dict[str, StopReport] | Exception) -> None:

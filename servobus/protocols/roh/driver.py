@@ -125,12 +125,10 @@ class RohDriver(Driver):
         return Fence(self.timing, node, address, count, list, refusable=refusable)
 
     def _is_unchanged(self, hand: Hand, enabled: Collection[str]) -> Plan[bool]:
-        """Return whether the registers of the enabled fingers hold what they held."""
-        names = {
-            finger: (finger.target_name, "speed", *finger.held.settings) for finger in hand.fingers if finger.name in enabled
-        }
+        """Return whether the enabled fingers show that their hand has not restarted."""
+        fingers = [finger for finger in hand.fingers if finger.name in enabled]
         try:
-            return (yield from hand.is_kept(names))
+            return (yield from hand.is_kept(_evidence(hand, fingers)))
         except DeviceError:
             return True  # it answers, and does not report these registers
 

@@ -70,7 +70,7 @@ def _hold(hand: Hand, targets: Targets, written: Written) -> Plan[Failures]:
     """Read where the fingers are, and write that. Returns the fingers that it failed for."""
     try:
         yield from hand.attach()
-        expected = {finger: _estimate(hand, finger, target) for finger, target in targets.items()}
+        expected = {finger: _expected(hand, finger, target) for finger, target in targets.items()}
         places = yield from hand.explained(locate(hand, expected))
         failed = yield from write_values(hand, [RegisterValue(finger, finger.target_name, raw) for finger, raw in places.items()])
     except ServobusError as error:
@@ -106,6 +106,12 @@ def _text(finger: Finger, raw: int) -> str:
 def _with_note(report: StopReport, target: StopTarget) -> StopReport:
     limp = target.kind == "limp" and report.action == "hold" and report.confirmed
     return StopReport("hold", report.written, confirmed=True, detail=HOLDS) if limp else report
+
+
+def _expected(hand: Hand, finger: Finger, target: StopTarget) -> int | None:
+    """Return where a finger is expected to be read: where it is taken to be, else at its last target."""
+    estimate = _estimate(hand, finger, target)
+    return next(iter(finger.held.targets), None) if estimate is None else estimate
 
 
 def _estimate(hand: Hand, finger: Finger, target: StopTarget) -> int | None:

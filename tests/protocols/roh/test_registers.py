@@ -56,7 +56,7 @@ def test_through_an_arm_no_question_is_longer_than_it_carries() -> None:
     for servo in CHANNELS:
         bench.run(bench.driver.enable(servo))
     assert bench.run(bench.driver.fence(2, [], bench.driver.nodes))
-    assert max(request.frame[5] for request in bench.sent if request.frame[1] == READ) == 12
+    assert max(request.frame[5] for request in bench.sent if request.frame[1] == READ) <= 12
     with pytest.raises(NotSupported, match=r"has 18 words, one read on this line 12: read it in parts, 2000:12"):
         bench.driver.read_register("thumb_bend", "force_ex")
     with pytest.raises(LimitError, match="LEN 1 to 12"):
