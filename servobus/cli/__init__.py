@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import signal
 import sys
 from typing import Any
 
 import click
 
-from servobus.cli.ending import INTERRUPTED, Ending
+from servobus.cli.ending import INTERRUPTED, TERMINATED, Ending
 from servobus.cli.output import accept_any_encoding, echo
 from servobus.errors import ServobusError
 
@@ -95,7 +96,11 @@ def cli() -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and end the process with its exit status."""
-    sys.exit(status_of(arguments))
+    status = status_of(arguments)
+    if status in (INTERRUPTED, TERMINATED):  # all is done and said, and one more signal must not change the status
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)
 
 
 def status_of(arguments: list[str] | None = None) -> int:

@@ -22,8 +22,8 @@ def run(
     """Run a coroutine in an event loop of its own.
 
     Ctrl-C and each of `signals` cancel it, so that exit policies are applied; what is done then is said at once. A second one
-    says what is left energised, and ends the process at once, with 130 after Ctrl-C and 143 otherwise. The exit status after one
-    of `signals` is `terminated`; after Ctrl-C it is 130.
+    says what is left energised, and ends the process at once, with 130 after Ctrl-C and 143 otherwise; so it does until the
+    process ends, also when the coroutine has ended. After one of `signals` the exit status is `terminated`, after Ctrl-C 130.
     """
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_until_signalled(main, terminated, signals))
@@ -65,5 +65,6 @@ async def _until_signalled(main: Callable[[], Coroutine[Any, Any, R]], status: i
             raise
         raise (KeyboardInterrupt() if received[0] == signal.SIGINT else SystemExit(status)) from None
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        if not received:
+            for number, handler in before.items():
+                signal.signal(number, handler)

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,21 @@ def test_the_second_signal_says_what_stays_energised_and_ends_at_once(
         assert "servobus: left energised: arm/s1" in err
         answer = document(out)
         assert answer["left"]["arm/s1"]["confirmed"] is False
+
+
+@pytest.mark.parametrize("pause_ms", [0, 5, 10, 20, 40, 80])
+def test_a_second_ctrl_c_at_any_moment_is_an_interrupted_command(pause_ms: int, tmp_path: Path) -> None:
+    with moving(write_config(tmp_path / "rig.yaml", "sts")) as process:
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        assert any("interrupted" in line for line in process.stderr)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(pause_ms / 1000)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "Traceback" not in err
+        assert "arm/s1" in err
 
 
 def test_a_daemon_keeps_what_a_failing_command_moved_and_the_command_says_so(tmp_path: Path) -> None:
