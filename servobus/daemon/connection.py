@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import select
 import socket
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Awaitable, Coroutine
 from types import CoroutineType
 from typing import Any, Protocol, cast
@@ -172,15 +172,16 @@ class ClientConnection(asyncio.Protocol):
             self.write(refusal.reply() + b"\n")
             self._transport.close()
             return
-        since = self._now() - self.door.stand_still.seconds()
+        since = self.door.stand_still.earliest()
         if self._paused_at is not None:
             since, self._paused_at = min(since, self._paused_at), None
         ahead = []
-        allowed = Counter(URGENT_CALLS)
+        allowed = dict(URGENT_CALLS)
         for line in lines:
             methods = urgent(line)
             if methods and all(allowed[method] for method in methods):
-                allowed.subtract(methods)
+                for method in methods:
+                    allowed[method] -= 1
                 ahead.append(line)
             elif line.strip():
                 self._lines.append((line, since))

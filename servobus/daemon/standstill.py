@@ -27,9 +27,9 @@ class StandStill:
         self._late, self._ticked_at = max(0.0, now - self._ticked_at - PERIOD), now
         self._timer = self._loop.call_later(PERIOD, self._tick)
 
-    def seconds(self) -> float:
-        """Return how long the loop stood still, at most, before what is read now."""
-        return max(self._late, self._now() - self._ticked_at - PERIOD)
+    def earliest(self) -> float:
+        """Return since when what is read now may have waited: now, less the time in which the loop stood still."""
+        return min(self._now() - self._late, self._ticked_at + PERIOD)
 
     def close(self) -> None:
         self._timer.cancel()
