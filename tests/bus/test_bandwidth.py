@@ -44,7 +44,7 @@ def test_polls_count_question_pause_and_answer() -> None:
 def test_latencies() -> None:
     load = load_of("a: {id: 1, model: sms}", poll="{health: 1}", latency=0.002, timeout_ms="10")
     longest = 8 * BYTE + TURNAROUND + (6 + 31) * BYTE
-    stop = 8 * BYTE + TURNAROUND + (6 + 34) * BYTE + 11 * BYTE  # mode to moving are read, and the present position is the goal
+    stop = 8 * BYTE + TURNAROUND + (6 + 34) * BYTE + 2 * 11 * BYTE  # mode to moving are read, then the goal twice
     assert load.estop_latency == pytest.approx(longest + stop + 0.002)
     assert load.silent_latency == pytest.approx(0.010 + 0.002)
 

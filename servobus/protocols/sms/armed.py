@@ -51,9 +51,10 @@ class Armed:
     def __contains__(self, node: int) -> bool:
         return node in self._nodes
 
-    def sent(self, node: int) -> bool:
-        """Whether a REG WRITE of ours waits in this node, or may wait there."""
-        return self._nodes.get(node) is Suspicion.SENT
+    @property
+    def sent(self) -> bool:
+        """Whether a REG WRITE of ours waits in some node, or may wait there."""
+        return Suspicion.SENT in self._nodes.values()
 
     # What happens to a node
 
@@ -88,6 +89,10 @@ class Armed:
         for node in nodes:
             if self._nodes.get(node) in OURS:
                 yield from self._obstacle(node)
+
+    def disarm_sent(self, nodes: Collection[int]) -> Plan[None]:
+        """Disarm those of these nodes in which a REG WRITE of ours may wait that was never fired."""
+        yield from self.disarm_ours([node for node in nodes if self._nodes.get(node) is Suspicion.SENT])
 
     def disarm(self, servo: HostServo) -> Plan[bool]:
         """Let the servo fire a write that moves nothing. Return whether its flag was read as 0 then.

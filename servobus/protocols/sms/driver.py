@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from typing import Any
 
+from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Driver, GoalPlan, Plan, Poll, Request, ask
 from servobus.protocols.fence import fence
 from servobus.protocols.sms.armed import Armed
@@ -74,8 +75,7 @@ class SmsDriver(Driver):
         self._armed.suspect(node)
         if not enabled:
             return True
-        sentinel = servo.model.sentinel
-        return (yield from ask(servo.read_raw(servo.model.registers[sentinel.name]))) != sentinel.reset
+        return (yield from _keeps_sentinel(servo))
 
     def inspect(self, node: int) -> Plan[Identity]:
         return inspect(node, self._armed)
@@ -133,3 +133,13 @@ class SmsDriver(Driver):
 
     def preview_goals(self, goals: Sequence[ServoGoal]) -> Sequence[Request[Any]]:
         return self._goals.preview(goals)
+
+
+def _keeps_sentinel(servo: HostServo) -> Plan[bool]:
+    """Whether the servo has not restarted since it was enabled. A lost reply is asked for once more, with another length."""
+    name, reset = servo.model.sentinel.name, servo.model.sentinel.reset
+    try:
+        registers = yield from ask(servo.read_registers((name,)))
+    except ReplyTimeout:
+        registers = yield from ask(servo.read_registers((name,), more=2))
+    return registers[name] != reset

@@ -84,8 +84,8 @@ class GoalWriter:
         for part in parts:
             if part.settings:
                 part.servo.forget(part.settings)
-            if self._armed.sent(part.servo.node):
-                yield from self._armed.disarm_ours((part.servo.node,))
+        if self._armed.sent:
+            yield from self._armed.disarm_sent({part.servo.node for part in parts})
         request = self._frame(parts)
         yield request
         for part in parts:

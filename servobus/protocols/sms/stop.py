@@ -12,9 +12,9 @@
 | hold, any other mode, or a servo that is not identified | torque 0 | torque reads 0 |
 
 1. At once, without a question: torque 0 for who goes limp, speed 0 and PWM 0 where these rule, and the estimate of the present
-   position for an enabled servo that is offline. SYNC WRITE frames have no reply, so each is sent twice.
+   position for an enabled servo that is offline. SYNC WRITE frames have no reply, so each is sent twice, here and below.
 2. In rounds: each servo that is not confirmed yet is read (mode, torque, goal, position in one turn; one SYNC READ for those that
-   know it), and what its rule asks for is written straight after. A round reads anew, so no old position is ever repeated.
+   know it), and what its rule asks for is written straight after. A round reads anew, so no old position is written again.
    A servo that does not answer gets the estimate once; it delays the others by its own turn alone.
 3. What we armed with REG WRITE is disarmed.
 
@@ -69,7 +69,7 @@ class Stopper:
         at_once = self._at_once(stops)
         questions = [_question(group, 0) for group in self._groups([stop for stop in stops if not stop.report.written])]
         holds = [(stop.servo, write) for stop in stops if (write := stop.estimate()) is not None]
-        return [*at_once, *questions, *self._frames(holds)]
+        return [*at_once, *questions, *self._twice(holds)]
 
     def blind(self, servo: HostServo, target: StopTarget) -> Sequence[Request[Any]]:
         """Return what stops a servo that does not answer, and may be sent for ever."""
@@ -113,7 +113,7 @@ class Stopper:
             if doubtful := [stop for stop in group if stop.is_doubtful]:
                 yield from self._read(doubtful, more)
         writes = [(stop.servo, write) for stop in group if (write := stop.next_write(number)) is not None]
-        for frame in self._frames(writes):
+        for frame in self._twice(writes):
             yield from ask(frame)
 
     def _read(self, stops: Sequence[Stop], more: int) -> Plan[None]:
@@ -132,6 +132,10 @@ class Stopper:
     def _at_once(self, stops: Sequence[Stop]) -> list[SyncWrite]:
         """Return what is written without a question, each frame as often as it is sent."""
         writes = [(stop.servo, write) for stop in stops if (write := stop.at_once()) is not None]
+        return self._twice(writes)
+
+    def _twice(self, writes: Sequence[tuple[HostServo, Writes]]) -> list[SyncWrite]:
+        """Return the frames that carry these writes, each as often as it is sent."""
         return [frame for frame in self._frames(writes) for _ in range(REPEATS)]
 
     def _frames(self, writes: Sequence[tuple[HostServo, Writes]]) -> list[SyncWrite]:

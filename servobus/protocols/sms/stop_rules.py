@@ -8,7 +8,7 @@ from servobus.protocols.model import Register
 from servobus.protocols.sms.servo import UNKNOWN, HostServo
 from servobus.values import StopReport, StopTarget
 
-ROUNDS = 4
+ROUNDS = 6
 REST_ROUND = 2
 """The round in which a servo in step mode that still does not rest goes limp."""
 MAX_SILENCES = 3
