@@ -12,7 +12,7 @@ from servobus.errors import LimitError, NotSupported
 from servobus.protocols.roh.model import FULL, RohModel, RohRegister
 from servobus.protocols.roh.options import CHANNELS, RohServo
 from servobus.protocols.roh.spans import Span
-from servobus.protocols.speed import goal_speed
+from servobus.protocols.speed import default_speed, goal_speed
 from servobus.values import Loss, ServoGoal, Update, is_number
 
 BY_UNIT = {"%": ("pos_target", "pos"), "deg": ("angle_target", "angle")}
@@ -180,6 +180,10 @@ class Finger:
             limits = f"{ends[0]:g} to {ends[1]:g}, the range of {self.options.channel}"
             raise LimitError(f"position {position:g} is outside {limits}: nothing was sent", servo=self.name)
         return raw
+
+    def default_speed(self, model: RohModel) -> int:
+        """Return the raw speed of a goal that names none."""
+        return self._raw_speed(model, default_speed(self.options, model_speed=0.0))
 
     def wanted_settings(self, model: RohModel, goal: ServoGoal) -> dict[str, int]:
         """Return the raw speed and current limit: that of the goal's or the config's effort, else the finger's own.

@@ -113,11 +113,8 @@ def test_a_goal_without_speed_and_effort_has_those_of_the_config() -> None:
     }
     bench = Bench(servos).enable()
     bench.move(goal("index", 10), goal("middle", 10))
-    assert bench.frames() == [
-        "unit 2 WRITE 1096 = 589",
-        "unit 2 WRITE 1126 to 1127 = 16384 49151",
-        "unit 2 WRITE 1136 to 1137 = 6554 6554",
-    ]
+    assert bench.frames() == ["unit 2 WRITE 1096 = 589", "unit 2 WRITE 1136 to 1137 = 6554 6554"]
+    assert [bench.hand.peek("speed", channel) for channel in (1, 2)] == [16384, 49151], "since they were enabled"
     bench.move(goal("index", 10, effort=100))
     assert bench.frames() == ["unit 2 WRITE 1096 = 1178", "unit 2 WRITE 1136 = 6554"]
 

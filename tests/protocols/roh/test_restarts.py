@@ -168,6 +168,16 @@ def test_an_angle_that_the_hand_replaced_by_its_own_limit_is_no_restart() -> Non
     assert verify(bench.after(5), "index") == {"index": Loss.RESTARTED}
 
 
+@MAPS
+def test_a_restart_shows_whatever_speed_a_hand_starts_with(name: str) -> None:
+    bench = Bench({"index": {**HAND["index"], "speed": 40}}, maps={2: name})
+    bench.hand.poke("speed", 1, 0)
+    bench.enable("index")
+    assert bench.read("index", "speed", raw=True) == 26214
+    bench.hand.poke("speed", 1, 0)
+    assert verify(bench, "index") == {"index": Loss.RESTARTED}
+
+
 # Enable
 
 
@@ -234,7 +244,7 @@ def test_a_hand_that_is_not_ready_is_not_enabled(state: str, reason: str) -> Non
 def test_a_hand_that_does_not_keep_what_was_written_is_not_enabled() -> None:
     bench = Bench()
     bench.altered = [(1126, 65535), (1126, 65535)]
-    with pytest.raises(DeviceError, match="register speed reads 65535 after it was written"):
+    with pytest.raises(DeviceError, match="register speed reads 65535 after 65534 was written"):
         bench.run(bench.driver.enable("index"))
 
 
