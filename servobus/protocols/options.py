@@ -192,7 +192,7 @@ class BusOptions(Data):
         servos, others = _servos_of(self), _servos_of(other)
         return (
             _fixed(self) == _fixed(other)
-            and list(servos) == list(others)
+            and servos.keys() == others.keys()
             and all(_fixed(servo) == _fixed(others[name]) for name, servo in servos.items())
         )
 

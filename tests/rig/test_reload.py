@@ -50,6 +50,22 @@ async def test_nothing_changed_nothing_happens(path: Path) -> None:
 
 
 @virtual
+async def test_another_order_of_keys_and_servos_is_no_change(path: Path) -> None:
+    text = TWO.replace(
+        "{s1: {id: 1, model: sts, on_exit: limp}}", "{s1: {id: 1, model: sts, on_exit: limp}, s3: {id: 3, model: sts}}"
+    )
+    write(path, text)
+    async with open_rig(path) as rig:
+        before = dict(rig.buses)
+        await rig.enable()
+        other = "{s3: {model: sts, id: 3}, s1: {on_exit: limp, id: 1, model: sts}}"
+        write(path, text.replace("{s1: {id: 1, model: sts, on_exit: limp}, s3: {id: 3, model: sts}}", other))
+        assert await rig.reload() == Reload()
+        assert rig.buses == before
+        assert rig.snapshot()["arm/s1"].enabled
+
+
+@virtual
 async def test_a_changed_bus_is_left_as_at_exit_and_the_others_go_on(path: Path) -> None:
     async with open_rig(path) as rig:
         await rig.enable()
