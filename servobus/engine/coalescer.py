@@ -90,7 +90,7 @@ class Coalescer:
 
     def take(self, now: float, ready: Collection[int]) -> Group | None:
         """Return the next group whose nodes are all ready. Goals that expired or whose caller has left are dropped first."""
-        self.expire(now)
+        self.expire(now, ready)
         for first in self.tickets.values():
             members = self._group_of(first, ready)
             if members:
@@ -99,11 +99,15 @@ class Coalescer:
                 return Group(members, first.batch is not None, first.confirm)
         return None
 
-    def expire(self, now: float) -> None:
-        """End the goals that expire by now or whose caller has left, and the groups they belong to."""
+    def expire(self, now: float, ready: Collection[int] = ()) -> None:
+        """End the goals that expire by now or whose caller has left, and the groups they belong to.
+
+        A goal whose node is `ready`, and that waited for others of its group, is withheld because of them.
+        """
         late = [ticket for ticket in self.tickets.values() if ticket.expires <= now or ticket.gone()]
         if late:
-            self._end(late, _expired)
+            held_up = {ticket.batch for ticket in late if ticket.batch is not None and ticket.node not in ready}
+            self._end([ticket for ticket in late if ticket.batch not in held_up or ticket.node not in ready], _expired)
 
     def next_expiry(self) -> float | None:
         return min((ticket.expires for ticket in self.tickets.values()), default=None)

@@ -233,7 +233,7 @@ class Scheduler:
     def expire(self, now: float) -> None:
         """End what is too old. Called when nothing can be sent, or nothing is due."""
         self.requests.expire(now)
-        self.goals.coalescer.expire(now)
+        self.goals.coalescer.expire(now, self.nodes.reachable())
         self._end_parked(now)
 
     # Offline nodes

@@ -20,7 +20,7 @@ from servobus.engine.job import Callback, Job
 from servobus.protocols.base import Motion
 from servobus.values import Loss
 
-MIN_AGE, MAX_AGE = 0.02, 0.2
+MIN_AGE, MAX_AGE = 0.004, 0.2
 """Bounds of `max_age`, in seconds."""
 COST = 5
 """How many times as long as it took a verification is worth something."""

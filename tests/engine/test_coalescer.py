@@ -192,3 +192,12 @@ def test_a_stream_that_leaves_now_and_then_is_superseded_only() -> None:
         if count % 2:
             assert coalescer.take(at, ALL) is not None
     assert kinds(ended) == [("s1", Outcome.SUPERSEDED)] * 4
+
+
+def test_a_group_that_expires_names_the_servo_that_it_waited_for() -> None:
+    ended: Ended = []
+    coalescer = coalescer_of(ticket(1, ended, batch=1), ticket(2, ended, batch=1))
+    assert coalescer.take(0.5, (1,)) is None
+    coalescer.expire(1.0, (1,))
+    assert kinds(ended) == [("s2", GoalExpired), ("s1", ActionWithheld)]
+    assert "together with s2" in str(ended[1][1])
