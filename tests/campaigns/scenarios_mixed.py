@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig
 from servobus.values import StopReport
-from tests.campaigns.bench import AWAY, HOME, KST, MODES, ROH, SMS, SPEED, Bench, Case, Figures, moved, tried
+from tests.campaigns.bench import ARM, AWAY, HOME, KST, MODES, ROH, SMS, SPEED, Bench, Case, Figures, moved, tried
 from tests.campaigns.scenarios_stops import EFFECT
 from tests.campaigns.witness import WitnessServo
 from tests.campaigns.witness_sms import SmsServo
@@ -139,6 +139,7 @@ class Mixed:
         name = self.rng.choice(NAMES)
         servo = self.servo(name)
         assert isinstance(servo, SmsServo)
+        await asyncio.sleep(0.002)  # what has left arrives
         servo.advance(self.bench.now)
         servo.trip()
         await asyncio.sleep(0.06)  # a goal may leave on what was read up to 50 ms before
@@ -177,4 +178,5 @@ async def mixed(case: Case, rng: random.Random, figures: Figures) -> None:
 
 
 VELOCITY = [case for case in MODES if case.mode == "velocity"]
-RULES = [("all: verbs and troubles in any order", mixed, [*SMS, *VELOCITY, KST, ROH], 450)]
+CASES = [replace(case, polls=polls) for case in (*SMS, *VELOCITY, KST, ROH, ARM) for polls in ("polls", "no polls")]
+RULES = [("all: verbs and troubles in any order", mixed, CASES, 1000)]

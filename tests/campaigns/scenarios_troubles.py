@@ -18,8 +18,8 @@ from tests.campaigns.witness_kst import KstServo
 from tests.campaigns.witness_roh import RohHand
 from tests.campaigns.witness_sms import GOAL, MAX_LIMIT, MIN_LIMIT, SmsServo
 
-LOSS = {"sms": 0.2, "kst": 0.2, "roh": 0.1}
-"""Share of requests, and of replies, that are lost. The stop of a hand takes more turns in a row than that of a servo."""
+LOSS = 0.1
+"""Share of requests, and of replies, that are lost: a fifth of all turns."""
 
 
 async def restart_and_stop(case: Case, rng: random.Random, figures: Figures) -> None:
@@ -65,12 +65,12 @@ async def owed_in_mode(case: Case, rng: random.Random, figures: Figures) -> None
 
 
 async def lossy_line(case: Case, rng: random.Random, figures: Figures) -> None:
-    """On a line that loses frames every servo is stopped all the same."""
+    """On a line that loses a fifth of all turns every servo is stopped all the same."""
     bench = Bench(case, rng, 4)
     async with bench.rig() as rig:
         await rig.enable("s1", "s2", "s3", "s4")
         for servo in bench.servos:
-            servo.loss = LOSS[case.protocol]
+            servo.loss = LOSS
         for number in range(1, 5):
             await moved(rig, f"s{number}", bench.units[AWAY], bench.units[SPEED] / 10)
         await asyncio.sleep(rng.uniform(0, 0.3))
