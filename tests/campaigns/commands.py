@@ -119,6 +119,7 @@ async def interrupted(case: Case, rng: random.Random, figures: Figures) -> None:
             await asyncio.sleep(0.01)
             process.send_signal(signal.SIGINT)
         ended = await end_of(process)
+        bench.line.settle()
         moves = sms(bench.servos[0]).moves()
         if ended.status not in (130, -signal.SIGINT) or "s1" not in ended.text or (moves and not twice):  # a shell shows 130
             figures.broken.append(f"status {ended.status}, twice {twice}, moves {moves}: {ended.text[:200]}")
@@ -130,6 +131,7 @@ async def stop_command(case: Case, rng: random.Random, figures: Figures) -> None
     with shell(bench) as commands:
         set_off(sms(bench.servos[0]), bench.line.clock())
         ended = await commands.run("stop")
+        bench.line.settle()
         figures.false_stops += ended.status == 0 and sms(bench.servos[0]).moves()
         if ended.status:
             figures.broken.append(f"status {ended.status}: {ended.text[:200]}")
