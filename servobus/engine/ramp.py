@@ -10,7 +10,8 @@ never has farther to go than one cycle at the wanted speed. The cases:
    ramp goes on from there.
 4. A setpoint that fails or is superseded ends the ramp, and so does its node when it goes offline. `cut(servo, error)` reports
    it; the error of the first setpoint goes to the caller instead.
-5. A newer goal replaces the ramp and starts at the last setpoint, where the servo is or is going.
+5. A newer goal replaces the ramp and starts at the last setpoint, where the servo is or is going. Its first step is shorter where
+   that setpoint is less than a cycle old: a stream of goals is no faster than one goal.
 6. A cycle that comes late is not caught up with: the next setpoint is one whole period later.
 
 The last setpoint of a servo belongs to its record: `begin` is given it, and `sent(servo, setpoint)` reports each one that was
@@ -44,16 +45,18 @@ class Ramp:
     """The last one that was delivered; before the first, where the ramp starts."""
     due: float
     """When the next setpoint leaves."""
+    made_at: float
+    """When the last setpoint was made."""
     under_way: bool = True
     """A setpoint was made that has not ended."""
     begun: bool = False
     """The first setpoint was delivered."""
 
-    def advance(self) -> ServoGoal:
-        """Return the next setpoint, one cycle on; the last one is the goal itself."""
+    def advance(self, share: float = 1.0) -> ServoGoal:
+        """Return the next setpoint, one cycle or a share of it on; the last one is the goal itself."""
         target = self.goal.goal.value
-        left = target - self.setpoint
-        value = target if abs(left) <= self.step else self.setpoint + math.copysign(self.step, left)
+        left, step = target - self.setpoint, share * self.step
+        value = target if abs(left) <= step else self.setpoint + math.copysign(step, left)
         return replace(self.goal, goal=replace(self.goal.goal, value=value), lead=self.step, applied=None, packed=None)
 
     def delivered(self, setpoint: ServoGoal) -> bool:
@@ -71,6 +74,8 @@ class SetpointRamps:
         self._cut = cut
         self._sent = sent
         self.active: dict[str, Ramp] = {}
+        self._made_at: dict[str, float] = {}
+        """Servo -> when its last setpoint was made that was delivered."""
 
     def use_rate(self, hz: float) -> None:
         """Take another rate of setpoints. Ramps under way keep their speed."""
@@ -86,9 +91,10 @@ class SetpointRamps:
         goal = ticket.goal
         start = goal.start if start is None else start
         assert start is not None, "a driver that asks for a ramp refuses a goal without a start"
-        ramp = Ramp(goal, ticket.node, ticket.expires - now, speed * self._period, start, now + self._period)
+        ramp = Ramp(goal, ticket.node, ticket.expires - now, speed * self._period, start, now + self._period, now)
         self.active[ticket.servo] = ramp
-        ticket.goal = ramp.advance()
+        before = self._made_at.get(ticket.servo, -math.inf)
+        ticket.goal = ramp.advance(min(1.0, (now - before) / self._period))
         ticket.done = partial(self._first_ended, ramp, ticket.goal, ticket.done)
 
     def due(self, now: float) -> list[Ticket]:
@@ -98,7 +104,7 @@ class SetpointRamps:
             if not ramp.under_way and ramp.due <= now:
                 following = ramp.due + self._period
                 ramp.due = following if following > now else now + self._period
-                ramp.under_way = True
+                ramp.under_way, ramp.made_at = True, now
                 goal = ramp.advance()
                 ended, gone = partial(self._ended, ramp, goal), partial(self._is_gone, ramp)
                 tickets.append(Ticket(goal, ramp.node, now + ramp.start_within, ended, gone=gone))
@@ -137,6 +143,7 @@ class SetpointRamps:
 
     def _deliver(self, ramp: Ramp, setpoint: ServoGoal) -> bool:
         last = ramp.delivered(setpoint)
+        self._made_at[ramp.goal.servo] = ramp.made_at
         self._sent(ramp.goal.servo, ramp.setpoint)
         return last
 

@@ -204,10 +204,26 @@ def test_a_newer_goal_goes_on_from_the_last_setpoint() -> None:
     (second,) = bench.ramps.due(0.1)
     second.done(Outcome.ACKED)
     newer = bench.begin(-50, start=0.0, now=0.15)
-    assert newer.goal.goal.value == 10, "from 20, where it was last sent, and not from where it was read"
+    assert newer.goal.goal.value == 15, "from 20, where it was last sent half a cycle ago, and not from where it was read"
     assert bench.ramps.due(0.2) == [], "the older ramp has ended"
     newer.done(Outcome.ACKED)
     assert bench.ramps.next_due() == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("hz", [3.0, 10.0, 40.0, 1000.0])
+def test_a_stream_of_goals_is_no_faster_than_one_goal(hz: float) -> None:
+    bench = Bench()
+    for number in range(round(hz) + 1):
+        bench.begin(1000, now=number / hz).done(Outcome.ACKED)
+    assert bench.setpoint == pytest.approx(10 + min(1.0, hz / HZ) * 100)
+
+
+def test_a_stream_of_which_most_is_superseded_keeps_its_speed() -> None:
+    bench = Bench()
+    bench.begin(1000).done(Outcome.ACKED)
+    for number in range(1, 41):
+        bench.begin(1000, now=number / 40).done(Outcome.SUPERSEDED if number % 4 else Outcome.ACKED)
+    assert bench.setpoint == pytest.approx(110)
 
 
 def test_a_caller_replaced_before_its_first_setpoint_left() -> None:
@@ -227,9 +243,9 @@ def test_a_dropped_ramp_ends_and_the_next_one_starts_at_the_last_setpoint() -> N
     assert bench.ramps.next_due() is None
     late.done(ReplyTimeout("lost"))
     assert bench.cuts == [], "it had ended before"
-    assert bench.begin(50, start=3.0).goal.goal.value == 20, "the record still has the last setpoint that was delivered"
+    assert bench.begin(50, start=3.0, now=0.2).goal.goal.value == 20, "the record still has the last setpoint that was delivered"
     bench.setpoint = None
-    assert bench.begin(50, start=3.0).goal.goal.value == 13
+    assert bench.begin(50, start=3.0, now=0.2).goal.goal.value == 13
     bench.ramps.drop({"a", "b"})
     assert bench.ramps.next_due() is None
 

@@ -245,3 +245,18 @@ async def test_a_poll_without_the_position_makes_no_position_fresh() -> None:
         assert age is not None
         assert age > 0.5
         assert (await bus.read("pan", max_age=0.2)).position == 30
+
+
+@virtual
+async def test_a_stream_of_goals_keeps_the_speed_and_leads_by_one_step() -> None:
+    """Four goals in each cycle, of which each would be a step."""
+    async with running(poll={"feedback": 50}) as (bus, servos, _):
+        joint = Joint(bus, servos[0])
+        await bus.motion.enable("pan")
+        began = bus.clock()
+        while bus.clock() < began + 1.0:
+            bus.motion.send("pan", Goal("position", 80.0, speed=30.0), confirm=False)
+            await asyncio.sleep(0.005)
+        servos[0].advance(bus.clock())
+        assert servos[0].position == pytest.approx(300, abs=12)
+        assert max(joint.leaps) <= STEP // 2 + 1
