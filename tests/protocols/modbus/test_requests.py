@@ -16,6 +16,7 @@ from servobus.protocols.modbus.requests import (
     ReadHolding,
     RtuTiming,
     UnansweredWrite,
+    UnitRead,
     WriteMultiple,
     WriteSingle,
 )
@@ -155,6 +156,14 @@ def test_a_units_refusal_shows_it_is_there_and_a_gateways_does_not() -> None:
         assert probe.parse([refused]) is None
     for code in (0x0A, 0x0B):
         assert not probe.answers(frame(encode(2, 0x83, bytes((code,)))))
+
+
+def test_a_gateways_refusal_is_silence_where_only_the_unit_itself_may_answer() -> None:
+    """0x0A and 0x0B are sent in the unit's name and say nothing about it ("Modbus application protocol", 7)."""
+    asked = UnitRead(TIMING, 2, 1000, 1, list)
+    assert [asked.answers(frame(encode(2, 0x83, bytes((code,))))) for code in (2, 4, 0x0A, 0x0B)] == [True, True, False, False]
+    with pytest.raises(DeviceError):
+        asked.parse([frame(encode(2, 0x83, b"\4"))])
 
 
 @pytest.mark.parametrize("refusable", [True, False])

@@ -183,6 +183,7 @@ async def test_a_map_that_is_not_the_pinned_one_is_reported_and_refused() -> Non
         hands[0].poke("protocol_version", 0, 0x0200)
         identity = await bus.identify("a")
         assert "config pins v1" in identity.notes[0]
+        assert identity.obstacle == identity.notes[0]
         assert "servo_note" in events
         with pytest.raises(DeviceError, match="config pins v1"):
             await bus.motion.enable("a")

@@ -17,7 +17,7 @@ from servobus.protocols.roh.driver import RohDriver
 from servobus.protocols.roh.options import CHANNELS
 from servobus.protocols.roh.spans import Span, read_spans, write_spans
 from servobus.values import ServoGoal, StopTarget
-from tests.protocols.roh.bench import HAND, THREE, Bench, all_fingers, goal, three_hands
+from tests.protocols.roh.bench import HAND, THREE, Bench, all_fingers, bus_options, goal, three_hands
 
 TARGETS = {"legacy": 1125, "v1": 1135, "v2": 1135}
 
@@ -156,6 +156,15 @@ def test_a_finger_whose_speed_was_refused_does_not_start() -> None:
     assert results["ring"] == "acked"
     assert "unit 2 WRITE 1138 = 65535" in bench.frames()
     assert bench.hand.fingers[1].target == 0
+
+
+def test_limits_and_speeds_are_taken_while_a_finger_is_enabled() -> None:
+    bench = Bench({"index": HAND["index"]}).enable()
+    assert bench.driver.use_options(bus_options({"index": {**HAND["index"], "speed": 40}}, poll={"feedback": 5}))
+    bench.move(goal("index", 10))
+    assert bench.frames() == ["unit 2 WRITE 1126 = 26214", "unit 2 WRITE 1136 = 6554"]
+    for servos, keys in (({"ring": HAND["ring"]}, {}), ({"index": HAND["index"]}, {"units": {2: {"model": "v1"}}})):
+        assert not bench.driver.use_options(bus_options(servos, **keys))
 
 
 # What no finger does
