@@ -143,7 +143,7 @@ async def torque_lost(case: Case, rng: random.Random, figures: Figures) -> None:
         await asyncio.sleep(rng.uniform(0, 1))
         bench.line.settle()
         servo.trip()
-        await asyncio.sleep(rng.uniform(0.06, 0.3))
+        await asyncio.sleep(rng.uniform(0.02, 0.3))
         bench.mark()
         for number in range(10 if end == "stream" else 0):
             await moved(rig, "s1", 20.0 + number, bench.units[SPEED])

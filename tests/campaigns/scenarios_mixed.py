@@ -142,7 +142,7 @@ class Mixed:
         await asyncio.sleep(0.002)  # what has left arrives
         servo.advance(self.bench.now)
         servo.trip()
-        await asyncio.sleep(0.06)  # a goal may leave on what was read up to 50 ms before
+        await asyncio.sleep(0.01)  # a goal may leave on what was read a few ms before
 
     async def deaf(self) -> None:
         self.servo(self.rng.choice(NAMES)).deaf_until = self.bench.now + self.rng.choice([0.05, 0.5, 1.0])

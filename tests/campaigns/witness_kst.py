@@ -14,7 +14,7 @@ STATUS, SET_POSITION, READ_ID, READ_POSITION, READ_VERSION = 0x10, 0x09, 0x18, 0
 SIZE = 14
 FULL_SPEED = 4000.0
 DEFAULT = 0.0
-BOOT = 0.05
+BOOT = 0.2
 """Seconds that it needs to start. A restart that takes no time, between two setpoints, shows on no wire."""
 
 

@@ -17,7 +17,7 @@ STATUS, CURRENT_LIMIT, SPEED, POS_TARGET, POS, END = 1085, 1095, 1125, 1135, 114
 CHANNELS = 6
 FULL_SPEED = 65535.0
 NO_ANSWER = 0x0B
-BOOT = 0.05
+BOOT = 0.2
 """Seconds that it needs to start, beside its self-test."""
 
 

@@ -19,7 +19,7 @@ TORQUE, GOAL, PWM, SPEED, TORQUE_LIMIT = 40, 42, 44, 46, 48
 POSITION, FLAG, STATUS, MOVING, GOAL_NOW = 56, 64, 65, 66, 67
 FULL_SPEED = 3000.0
 OVERLOAD = 0x20
-BOOT = 0.05
+BOOT = 0.2
 """Seconds that it needs to start; the vendor's protocol page says 1.8 s of a reboot."""
 
 
