@@ -18,7 +18,6 @@ from enum import Enum, auto
 
 from servobus.errors import ServobusError
 from servobus.protocols.base import Plan, ask
-from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Action, Read, RegWrite
 from servobus.protocols.sms.servo import UNKNOWN, HostServo
 
@@ -43,8 +42,7 @@ OURS = (Suspicion.SENT, Suspicion.FIRED)
 class Armed:
     """The table of one bus."""
 
-    def __init__(self, options: SmsBus, servos: Mapping[str, HostServo]) -> None:
-        self.options = options
+    def __init__(self, servos: Mapping[str, HostServo]) -> None:
         self._servos = {servo.node: servo for servo in servos.values()}
         self._nodes: dict[int, Suspicion] = {}
 
@@ -99,7 +97,7 @@ class Armed:
 
         EEPROM is locked; where it has another memory table than its model, torque 0, whose address is the same in every table.
         """
-        model, answered = servo.model, self.options.writes_answered
+        model, answered = servo.model, servo.answers_writes
         name, raw = (model.torque, 0) if servo.fit.mode == UNKNOWN else (model.lock, 1)
         register = model.registers[name]
         harmless = RegWrite(servo.node, register.address, servo.encode(register, raw), answered=answered)

@@ -39,14 +39,17 @@ class SmsDriver(Driver):
         self.servos = {name: HostServo(name, servo, models[servo.model]) for name, servo in options.servos.items()}
         self.nodes = {name: servo.node for name, servo in self.servos.items()}
         self._servo_at = {servo.node: servo for servo in self.servos.values()}
-        self._armed = Armed(options, self.servos)
+        self._armed = Armed(self.servos)
+        self._settings = SettingWriter()
         self._take(options)
 
     def _take(self, options: SmsBus) -> None:
         """Make the parts that follow from the options."""
+        for servo in self.servos.values():
+            if servo.fit.response_level is None:
+                servo.answers_writes = options.writes_answered
         self.options = options
         self._reader = Reader(options, self.servos)
-        self._settings = SettingWriter(options)
         self._goals = GoalWriter(options, self.servos, self._armed)
         self._stopper = Stopper(options, self._armed)
 
@@ -108,7 +111,7 @@ class SmsDriver(Driver):
 
     def enable(self, servo: str) -> Plan[float | None]:
         """Settings, goal := present, torque on, read back. An enable that fails half-way ends with torque off."""
-        return Enabler(self.servos[servo], self._goals.packers[servo], self.options, self._armed).plan()
+        return Enabler(self.servos[servo], self._goals.packers[servo], self._armed).plan()
 
     def disable(self, servo: str) -> Plan[StopReport]:
         return self._stopper.disable(self.servos[servo])

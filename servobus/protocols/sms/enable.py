@@ -24,7 +24,6 @@ from servobus.protocols.base import Plan, ask
 from servobus.protocols.sms.armed import Armed
 from servobus.protocols.sms.identity import learn
 from servobus.protocols.sms.model import LIMITS
-from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.packer import GoalPacker
 from servobus.protocols.sms.requests import Write, WriteOnce
 from servobus.protocols.sms.servo import TORQUE_ON, HostServo
@@ -39,10 +38,9 @@ SETTINGS = ("acceleration", "torque_limit")
 class Enabler:
     """The plan that enables one servo."""
 
-    def __init__(self, servo: HostServo, packer: GoalPacker, options: SmsBus, armed: Armed) -> None:
+    def __init__(self, servo: HostServo, packer: GoalPacker, armed: Armed) -> None:
         self._servo = servo
         self._packer = packer
-        self._answered = options.writes_answered
         self._armed = armed
         model = servo.model
         self._torque = model.registers[model.torque]
@@ -66,7 +64,7 @@ class Enabler:
             return (yield from (self._hold() if servo.takes == "position" else self._rest()))
         except ServobusError:
             with suppress(ServobusError):
-                yield from ask(Write(servo.node, self._torque.address, b"\x00", answered=self._answered))
+                yield from ask(Write(servo.node, self._torque.address, b"\x00", answered=self._servo.answers_writes))
             raise
 
     # Before anything is written
@@ -112,7 +110,7 @@ class Enabler:
             if before.get(name) != raw:
                 servo.forget({name: raw})
                 register = servo.model.registers[name]
-                yield from ask(Write(servo.node, register.address, servo.encode(register, raw), answered=self._answered))
+                yield from ask(Write(servo.node, register.address, servo.encode(register, raw), answered=servo.answers_writes))
                 servo.hold({name: raw})
 
     def _hold(self) -> Plan[float]:
@@ -142,7 +140,7 @@ class Enabler:
 
     def _write_once(self, address: int, data: bytes) -> Plan[None]:
         """Write, and never repeat it: the joint may have moved meanwhile."""
-        yield from ask(WriteOnce(self._servo.node, address, data, answered=self._answered))
+        yield from ask(WriteOnce(self._servo.node, address, data, answered=self._servo.answers_writes))
 
     # What is read
 

@@ -44,13 +44,12 @@ class GoalWriter:
     def plan(self, goals: Sequence[ServoGoal], *, together: bool, confirm: bool) -> list[GoalPlan]:
         """Return the fewest plans that carry these goals."""
         parts = [self._packed(goal) for goal in goals]
-        if len(parts) == 1 and (self.options.writes_answered or not confirm):
+        if len(parts) == 1 and (not confirm or parts[0].servo.answers_writes):
             return [GoalPlan((parts[0].servo.name,), self._write_frame(parts))]
         spans = {(part.address, len(part.data)) for part in parts}
         frames = list(self._split(parts))
         if confirm or len(spans) > 1 or (together and len(frames) > 1):
-            if not self.options.writes_answered:
-                _require_flags(parts)
+            _require_flags(parts)
             return [GoalPlan(_names(parts), self._reg_write_action(parts), len(parts) + 1)]
         return [GoalPlan(_names(frame), self._write_frame(frame)) for frame in frames]
 
@@ -77,7 +76,7 @@ class GoalWriter:
     def _frame(self, parts: Sequence[PackedGoal]) -> Write | SyncWrite:
         part = parts[0]
         if len(parts) == 1:
-            return Write(part.servo.node, part.address, part.data, answered=self.options.writes_answered)
+            return Write(part.servo.node, part.address, part.data, answered=part.servo.answers_writes)
         return SyncWrite(part.address, {part.servo.node: part.data for part in parts})
 
     def _write_frame(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
@@ -120,11 +119,11 @@ class GoalWriter:
         return results
 
     def _reg_write(self, part: PackedGoal) -> RegWrite:
-        return RegWrite(part.servo.node, part.address, part.data, answered=self.options.writes_answered)
+        return RegWrite(part.servo.node, part.address, part.data, answered=part.servo.answers_writes)
 
     def _arm(self, part: PackedGoal) -> Plan[None]:
         yield from ask(self._reg_write(part))
-        if not self.options.writes_answered and not (yield from ask(read_flag(part.servo.node))):
+        if not part.servo.answers_writes and not (yield from ask(read_flag(part.servo.node))):
             raise ReplyTimeout("the servo did not take the REG WRITE: its flag reads 0", servo=part.servo.name)
 
     def _obstacle(self, parts: Sequence[PackedGoal], armed: Sequence[PackedGoal]) -> Plan[str]:
@@ -153,7 +152,7 @@ def _names(parts: Sequence[PackedGoal]) -> tuple[str, ...]:
 
 def _require_flags(parts: Sequence[PackedGoal]) -> None:
     for part in parts:
-        if "async_write_flag" not in part.servo.model.registers:
+        if not part.servo.answers_writes and "async_write_flag" not in part.servo.model.registers:
             raise NotSupported(
                 "the servo answers no write and its REG WRITE flag cannot be read, so nothing can be confirmed: "
                 "set its response level to 1 and status_return to all",

@@ -160,7 +160,7 @@ def _value_obstacle(model: SmsModel, registers: Mapping[str, int]) -> str:
 
 def _level_notes(fit: Fit, options: SmsBus) -> Iterator[str]:
     if fit.response_level == 0 and options.writes_answered:
-        yield "its response level is 0, so it answers no write: set status_return: read_only, or every goal to it alone times out"
+        yield "its response level is 0, so it answers no write, whatever the config says: set status_return: read_only"
     if fit.response_level != 0 and not options.writes_answered:
         yield (f"it answers writes (response level {fit.response_level}), the config says status_return: {options.status_return}")
 

@@ -63,6 +63,8 @@ class HostServo:
         self.position, self.time, self.speed = (model.registers[name] for name in model.goal)
         self.fit = Fit()
         self.takes = self.fit.takes
+        self.answers_writes = True
+        """Whether it acknowledges writes: as the config says, until it was asked."""
         self.held: Mapping[str, int] = {}
         """Raw acceleration and torque limit as last written; a name is absent while its value is not known. The mapping is
         replaced when one changes, never changed."""
@@ -83,6 +85,8 @@ class HostServo:
         """Keep what the servo reported. An equal fit is not replaced, so goals packed for it remain valid."""
         if fit != self.fit:
             self.fit, self.takes = fit, fit.takes
+        if fit.response_level is not None:
+            self.answers_writes = fit.response_level != 0
 
     @property
     def limits(self) -> tuple[float, float] | None:

@@ -6,14 +6,12 @@ at power-off). It is written only while the torque is off.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError
 from servobus.protocols.base import Plan, ask
 from servobus.protocols.model import Register
 from servobus.protocols.sms.identity import learn
-from servobus.protocols.sms.options import SmsBus
 from servobus.protocols.sms.requests import Write
 from servobus.protocols.sms.servo import UNKNOWN, HostServo
 
@@ -21,11 +19,8 @@ COMMISSIONING = frozenset({"id", "baud_rate", "response_status_level"})
 """Registers whose change makes the config untrue, so that the servo is lost."""
 
 
-@dataclass(frozen=True, slots=True)
 class SettingWriter:
-    """The plans that write registers of one bus."""
-
-    options: SmsBus
+    """The plans that write registers."""
 
     def write(self, servo: HostServo, name: str, value: Any, *, raw: bool, persist: bool) -> Plan[Any]:
         """Check everything, then return the plan. Raises LimitError, UnknownName, NotSupported before the first frame."""
@@ -47,7 +42,7 @@ class SettingWriter:
             yield from self._write_eeprom(servo, register, data)
         else:
             yield from ask(self.request(servo, register, data))
-        if register.memory == "eeprom" or not self.options.writes_answered:
+        if register.memory == "eeprom" or not servo.answers_writes:
             reply = yield from ask(servo.read_raw(register))
             if reply != count:
                 raise DeviceError(
@@ -77,7 +72,7 @@ class SettingWriter:
 
     def request(self, servo: HostServo, register: Register, data: bytes) -> Write:
         """Return the WRITE of a register."""
-        return Write(servo.node, register.address, data, answered=self.options.writes_answered)
+        return Write(servo.node, register.address, data, answered=servo.answers_writes)
 
 
 def _refuse(servo: HostServo, register: Register, persist: bool) -> None:

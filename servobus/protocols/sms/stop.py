@@ -151,7 +151,7 @@ class Stopper:
         return frames
 
     def _write(self, servo: HostServo, register: Register, raw: int) -> Write:
-        return Write(servo.node, register.address, servo.encode(register, raw), answered=self.options.writes_answered)
+        return Write(servo.node, register.address, servo.encode(register, raw), answered=servo.answers_writes)
 
 
 def _question(stops: Sequence[Stop], more: int) -> Request[Mapping[int, Registers]]:

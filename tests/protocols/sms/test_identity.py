@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from servobus.protocols.sms.codec import Instruction
-from servobus.values import Identity
+from servobus.values import Identity, Outcome
 from tests.protocols.sms.bench import Bench
 
 
@@ -82,6 +82,20 @@ def test_unexpected_acknowledgements_are_noted() -> None:
     bench = Bench(status_return="read_only")
     set_register(bench, "response_status_level", 1)
     assert "it answers writes (response level 1)" in identity_of(bench).notes[0]
+
+
+@pytest.mark.parametrize("family", ["sts", "sms", "sms_cl", "scs"])
+@pytest.mark.parametrize(("configured", "level"), [("all", 0), ("read_only", 1)])
+def test_the_servos_own_response_level_counts(family: str, configured: str, level: int) -> None:
+    """Whatever the config says of it: no write waits for an acknowledgement that never comes, and none comes unasked."""
+    servos = {name: {"id": number, "model": family} for number, name in enumerate("ab", 1)}
+    bench = Bench(servos, status_return=configured)
+    for device in bench.devices.values():
+        device.memory.store(device.memory.registers["response_status_level"], level)
+    bench.enable()
+    assert bench.move({"a": 1.0}) == {"a": Outcome.ACKED if level else Outcome.SENT}
+    assert bench.move({"a": 2.0, "b": 2.0}, confirm=True) == {"a": Outcome.ACKED, "b": Outcome.ACKED}
+    assert bench.run(bench.driver.disable("a")).confirmed
 
 
 def test_mode_torque_and_limits() -> None:
