@@ -23,17 +23,19 @@ class LeaseWatch:
         self.lease_ms = lease_ms
         self.leases = Leases(lease_ms / 1000)
         self.holders, self.check, self.release = self.leases.holders, self.leases.check, self.leases.release
+        self.give_back = self.leases.give_back
         self._rig = rig
         self._loop = asyncio.get_running_loop()
         self._timer = CoarseTimer(self._loop, self._expire)
         self._labels: dict[Hashable, str] = {}
         self._stopping: set[asyncio.Task[None]] = set()
 
-    def take(self, client: Hashable, label: str, servos: Collection[str]) -> None:
-        """Take servos by moving them. Raises LeaseHeld."""
+    def take(self, client: Hashable, label: str, servos: Collection[str]) -> dict[str, int]:
+        """Take servos by moving them; see `Leases.take`. Raises LeaseHeld."""
         self._labels[client] = label
-        self.leases.take(client, label, servos, self._loop.time())
+        taken = self.leases.take(client, label, servos, self._loop.time())
         self._watch()
+        return taken
 
     def acquire(self, client: Hashable, label: str, servos: Collection[str]) -> set[str]:
         """Take servos on request, and return all that the client holds. Raises LeaseHeld."""

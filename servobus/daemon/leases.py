@@ -6,7 +6,7 @@ client. A client that lost a lease must acquire it again: a motion that it sent 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 
 from servobus.errors import LeaseHeld
@@ -28,6 +28,8 @@ class Leases:
         self._owner: dict[str, Hashable] = {}
         self._lost: dict[Hashable, set[str]] = {}
         self._blocked: dict[str, str] = {}
+        self._count = 0
+        self._taken: dict[str, int] = {}  # servo -> number of the call that acquired it last
 
     def holders(self) -> dict[str, str]:
         """Servo -> label of the client that holds it."""
@@ -51,13 +53,24 @@ class Leases:
         holder.servos.update(servos)
         holder.expires = now + self.ttl
         self._owner.update(dict.fromkeys(servos, client))
+        self._count += 1
+        self._taken.update(dict.fromkeys(servos, self._count))
         return set(holder.servos)
 
-    def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> None:
-        """Take servos by moving them. Raises LeaseHeld, also for one that this client lost and did not acquire again."""
+    def take(self, client: Hashable, label: str, servos: Collection[str], now: float) -> dict[str, int]:
+        """Take servos by moving them. Raises LeaseHeld, also for one that this client lost and did not acquire again.
+
+        Returns what it did not hold before, for `give_back`.
+        """
         if lost := self._lost.get(client, set()).intersection(servos):
             raise LeaseHeld("its motion lease has expired, so this may be an old motion: acquire it again", servo=sorted(lost)[0])
+        fresh = [servo for servo in servos if servo not in self._owner]
         self.acquire(client, label, servos, now)
+        return dict.fromkeys(fresh, self._count)
+
+    def give_back(self, client: Hashable, taken: Mapping[str, int]) -> None:
+        """Release what a refused motion has taken, unless the client has moved or acquired it since."""
+        self.release(client, {servo for servo, count in taken.items() if self._taken[servo] == count})
 
     def renew(self, client: Hashable, now: float) -> set[str]:
         """Prolong what the client holds by `ttl`, and return it."""

@@ -6,14 +6,27 @@ A handler returns the result, or a coroutine to await for it: what needs no turn
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, cast
 
 from servobus import __version__
 from servobus.daemon.lease_watch import LeaseWatch
 from servobus.daemon.subscriptions import Subscriber, Subscriptions
-from servobus.errors import AccessDenied, LimitError, LinkDown, NotSupported
+from servobus.errors import (
+    AccessDenied,
+    Busy,
+    EStopped,
+    GoalExpired,
+    InvalidRequest,
+    LimitError,
+    LinkDown,
+    NotEnabled,
+    NotSupported,
+    PartialFailure,
+    ServobusError,
+)
 from servobus.rig.interface import Rig, Servo
 from servobus.rig.local import LocalRig
 from servobus.rig.verbs import VERBS, LeaseRule, Verb, caller, servos
@@ -78,6 +91,8 @@ class LateRig:
         return await self._rig.send_all(shorter, together=together, confirm=confirm)
 
 
+REFUSALS = (Busy, EStopped, GoalExpired, InvalidRequest, LimitError, NotEnabled, NotSupported)
+"""Errors of a motion of which nothing was sent."""
 Handler = Callable[[Services, Client, Any], Any]
 
 
@@ -96,12 +111,24 @@ def _verb_handler(verb: Verb) -> Handler:
         names = servos(verb, rig, params)
         if age > PROMPT:
             _refuse_absent(client)
-        if not rig.stopped:  # what the e-stop refuses takes no lease
-            services.leases.take(client, client.label, names)
-        return call(rig if age <= PROMPT else cast("Rig", LateRig(rig, age)), params)
+        called = rig if age <= PROMPT else cast("Rig", LateRig(rig, age))
+        if rig.stopped:
+            return call(called, params)
+        fresh = services.leases.take(client, client.label, names)
+        return _moved(services.leases, client, fresh, partial(call, called, params)) if fresh else call(called, params)
 
     rules: dict[LeaseRule, Handler] = {LeaseRule.FREE: free, LeaseRule.TAKEN: taken}
     return rules.get(verb.lease, lambda services, _, params: call(services.rig, params))
+
+
+async def _moved(leases: LeaseWatch, client: Client, fresh: Mapping[str, int], motion: Callable[[], Awaitable[Any]]) -> Any:
+    """Await a motion. One that is refused takes no lease: it has moved nothing."""
+    try:
+        return await motion()
+    except ServobusError as error:
+        results = error.results if isinstance(error, PartialFailure) else dict.fromkeys(fresh, error)
+        leases.give_back(client, {name: fresh[name] for name in fresh if isinstance(results.get(name), REFUSALS)})
+        raise
 
 
 def _refuse_absent(client: Client) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from servobus.daemon.connection import MAX_TASKS
+from servobus.rpc.clock import machine
 from servobus.rpc.methods import MAX_BATCH, MAX_LINE
 from tests.daemon.raw_client import dialled, served
 from tests.simulated_rigs import config
@@ -174,6 +175,41 @@ async def test_a_lease_is_taken_by_moving_and_names_its_holder(tmp_path: Path) -
         assert list(await two.call("leases")) == ["arm/s1"]
         assert await two.call("move_to", name="s2", position=1) == "acked", "another servo is free"
         assert (await two.call("stop"))["arm/s1"]["confirmed"], "anyone may stop"
+
+
+REFUSED: dict[str, tuple[str, dict[str, Any]]] = {
+    "limit": ("move_to", {"name": "s1", "position": 999}),
+    "speed": ("move", {"positions": {"s1": 1}, "speed": -1}),
+    "kind": ("spin", {"name": "s1", "velocity": 5}),
+    "one of two": ("send_all", {"goals": {"s1": {"kind": "position", "value": 1}, "s2": {"kind": "position", "value": 999}}}),
+    "late": ("move_to", {"name": "s1", "position": 1, "asked": -99.0}),
+    "not enabled": ("move_to", {"name": "s3", "position": 1}),
+}
+
+
+@pytest.mark.parametrize("refused", REFUSED, ids=str)
+@virtual
+async def test_a_refused_motion_takes_no_lease(refused: str, tmp_path: Path) -> None:
+    """So the loss of a client that has moved nothing makes no servo go limp, and keeps nobody else from moving it."""
+    method, params = REFUSED[refused]
+    limp = [servo.replace("speed", "on_lost_client: limp, limits: [-90, 90], speed") for servo in SLOW]
+    async with served(tmp_path, config(*limp, "s3: {id: 3, model: sts}")) as (rig, _, path), dialled(path) as owner:
+        await owner.call("enable", names=["s1", "s2"])
+        async with dialled(path) as stranger:
+            await stranger.call("hello", machine=machine())
+            assert (await stranger.call(method, **params))["type"] in ("LimitError", "NotSupported", "GoalExpired", "NotEnabled")
+            assert await owner.call("leases") == {}
+        await asyncio.sleep(1)
+        assert [name for name, state in rig.snapshot().items() if state.enabled] == ["arm/s1", "arm/s2"]
+
+
+@virtual
+async def test_a_refused_motion_ends_no_lease(tmp_path: Path) -> None:
+    async with served(tmp_path, config(*SLOW)) as (_, _, path), dialled(path) as raw:
+        await raw.call("enable")
+        await raw.call("move_to", name="s1", position=60)
+        assert (await raw.call("move_to", name="s1", position=9999))["type"] == "LimitError"
+        assert list(await raw.call("leases")) == ["arm/s1"]
 
 
 @virtual
