@@ -53,6 +53,9 @@ class Stop:
         mode, target = self._mode(None), self.target
         ours = target.kind == "limp" or mode in ("pwm", "motor") or (target.enabled and mode == "velocity")
         write = self.blind() if ours or not target.reachable else None
+        if write == self._torque_off and target.kind == "hold":
+            reason = self._why_not_held(UNKNOWN)
+            self._report("limp", confirmed=False, detail=f"offline: torque off was written, and not confirmed: {reason}")
         if write is None and not target.reachable:
             write = self.estimate()
         return self._written(write)
@@ -138,7 +141,7 @@ class Stop:
             return self._end_steps(motion, before, number)
         write = self._rest_of(mode)
         if write == self._torque_off:
-            return self._limp(motion, self._why_not_held(mode))
+            return self._limp(motion, f"its torque was switched off: {self._why_not_held(mode)}")
         if write is None or motion[write[0].name] == write[1]:
             return self._report("hold", confirmed=True)
         self._report("hold", confirmed=False, detail=f"{write[0].name} does not read {write[1]}")
@@ -229,7 +232,7 @@ class Stop:
         reason = fit.obstacle or (
             "it was not identified" if mode == UNKNOWN else f"it is in {mode}, which its model does not know"
         )
-        return f"its torque was switched off, because it cannot be held: {reason}"
+        return f"it cannot be held: {reason}"
 
     def _why_outside(self, present: int) -> str:
         (low, high), at = self.servo.limits or (0.0, 0.0), self.servo.calibration.to_unit(present)

@@ -21,6 +21,17 @@ def test_an_offline_servo_is_written_to_without_waiting() -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
+def test_an_offline_servo_whose_mode_is_not_known_is_said_to_go_limp(family: str) -> None:
+    """Nothing else stops it whatever its mode is; "hold" would be a false word."""
+    bench = Bench({"a": {"id": 1, "model": family}})
+    device = moving(bench, "position")
+    report = stop(bench, target("a", enabled=False, reachable=False))["a"]
+    assert (report.action, report.written, report.confirmed) == ("limp", True, False)
+    assert report.detail == "offline: torque off was written, and not confirmed: it cannot be held: it was not identified"
+    assert travel(bench, device) == 0
+
+
+@pytest.mark.parametrize("family", FAMILIES)
 def test_a_silent_servo_is_held_where_it_is_taken_to_be(family: str) -> None:
     bench = Bench({"a": {"id": 1, "model": family, "unit": "step"}})
     bench.enable()
