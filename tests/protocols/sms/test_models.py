@@ -32,7 +32,7 @@ MAGNETIC: dict[str, Fact] = {
     "present_temperature": (63, 1, None, "ram"),
     "async_write_flag": (64, 1, None, "ram"),
     "moving": (66, 1, None, "ram"),
-    "present_current": (69, 2, None, "ram"),
+    "present_current": (69, 2, 15, "ram"),
 }
 FACTS: dict[str, dict[str, Fact]] = {
     "sms": {**MAGNETIC, "lock": (55, 1, None, "ram"), "position_offset": (31, 2, 11, "eeprom"), "mode": (33, 1, None, "eeprom")},
@@ -144,6 +144,7 @@ PHYSICAL = [
     ("sts", "present_voltage", 74, 7.4),
     ("sts", "present_load", -1000, -100.0),
     ("sts", "present_current", 100, 0.65),
+    ("sts", "present_current", -40, -0.26),
     ("sts", "present_temperature", 41, 41),
     ("sts", "return_delay", 250, 0.0005),
     ("sts", "protection_time", 200, 2.0),

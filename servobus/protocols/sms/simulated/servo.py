@@ -235,6 +235,6 @@ LIVE: dict[str, Callable[[SimulatedServo], float]] = {
     "servo_status": lambda servo: servo.faults,
     "moving": lambda servo: servo.joint.velocity != 0,
     "present_goal_position": lambda servo: servo.joint.target,
-    "present_current": lambda servo: abs(servo.load()) / 100 * AMPERES_AT_FULL_LOAD,
+    "present_current": lambda servo: servo.load() / 100 * AMPERES_AT_FULL_LOAD,
 }
 """Registers that are measured when they are read, in physical units."""
