@@ -17,7 +17,7 @@ from servobus.rig.local import LocalRig
 from servobus.values import StopReport
 from tests.campaigns.bench import ARM, AWAY, HOME, KST, MODES, ROH, SMS, SPEED, Bench, Case, Figures, moved, tried
 from tests.campaigns.scenarios_stops import EFFECT
-from tests.campaigns.witness import WitnessServo
+from tests.campaigns.witness import NEVER, WitnessServo
 from tests.campaigns.witness_sms import SmsServo
 
 STEPS = 60
@@ -139,6 +139,8 @@ class Mixed:
         name = self.rng.choice(NAMES)
         servo = self.servo(name)
         assert isinstance(servo, SmsServo)
+        servo.deaf_until = servo.mute_until = NEVER  # nothing can tell that the torque of a silent servo is gone
+        servo.loss = 0.0
         await asyncio.sleep(0.002)  # what has left arrives
         servo.advance(self.bench.now)
         servo.trip()
