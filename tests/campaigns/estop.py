@@ -1,7 +1,7 @@
-"""How long an e-stop takes, in real time: from the call to the last byte of the frame that stops the last servo.
+"""How long an e-stop takes: from the call to the last byte of the frame that stops the last servo.
 
-The servos are witnesses on lines in memory with their wire time, so that the time of each byte is known; the computer's own time
-is in the figures.
+The servos are witnesses on lines in memory with their wire time, so that the time of each byte is known. It is measured twice: in
+real time with what the computer needs itself, and in virtual time, where the wire alone counts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from time import monotonic
 
 from servobus.cli.event_loop import loop_factory
 from servobus.config.loader import parse_config
@@ -24,6 +23,7 @@ from tests.campaigns.bench import tried
 from tests.campaigns.witness import Sent, WitnessLine, witnessed
 from tests.campaigns.witness_kst import SET_POSITION, KstLine, KstServo
 from tests.campaigns.witness_sms import SYNC_WRITE, WRITE, SmsLine, SmsServo
+from tests.virtual_time import VirtualLoop
 
 SERVOS = 8
 CLIENTS = 100
@@ -57,6 +57,7 @@ class Latency:
     """Seconds of each e-stop."""
 
     setting: Setting
+    real: bool
     frames: list[float] = field(default_factory=list)
     """Until the last byte of the last servo's stop."""
     answers: list[float] = field(default_factory=list)
@@ -66,7 +67,7 @@ class Latency:
 
     def report(self) -> None:
         print(
-            f"{self.setting.name:38} last byte {_three(self.frames)}; confirmed {_three(self.answers)} ms; "
+            f"{self.setting.name:38} {'real time' if self.real else 'wire alone'}: last byte {_three(self.frames)}; confirmed {_three(self.answers)} ms; "
             f"{len(self.frames)} e-stops, {self.unconfirmed} not confirmed"
         )
 
@@ -77,9 +78,9 @@ def _three(seconds: Sequence[float]) -> str:
     return f"p50 {1e3 * statistics.median(ordered):.1f}, p99 {1e3 * p99:.1f}, max {1e3 * ordered[-1]:.1f}"
 
 
-def estop(setting: Setting, times: int) -> Latency:
-    latency = Latency(setting)
-    with asyncio.Runner(loop_factory=loop_factory()) as runner:
+def estop(setting: Setting, times: int, *, real: bool = True) -> Latency:
+    latency = Latency(setting, real)
+    with asyncio.Runner(loop_factory=loop_factory() if real else VirtualLoop) as runner:
         runner.run(_campaign(latency, times))
     return latency
 
@@ -123,9 +124,9 @@ async def _one(rig: LocalRig, first: WitnessLine, second: WitnessLine, latency: 
     await asyncio.sleep(rng.uniform(0, 0.02))
     alive = names[latency.setting.dead_servo :]
     first.log.clear()
-    began = monotonic()
+    began = first.clock()
     reports = await rig.stop()
-    latency.answers.append(monotonic() - began)
+    latency.answers.append(first.clock() - began)
     latency.frames.append(_last_stop(first, began) - began)
     latency.unconfirmed += sum(not reports[f"first/{name}"].confirmed for name in alive)
     for task in tasks:

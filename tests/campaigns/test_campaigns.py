@@ -73,9 +73,10 @@ def test_half_a_minute_of_the_days() -> None:
     assert result.outcomes["sent"] > 4000
 
 
+@pytest.mark.parametrize("real", [True, False], ids=["real", "virtual"])
 @pytest.mark.parametrize("setting", estop.SETTINGS, ids=lambda setting: setting.name)
-def test_estops_are_confirmed(setting: estop.Setting) -> None:
-    latency = estop.estop(setting, 3)
+def test_estops_are_confirmed(setting: estop.Setting, real: bool) -> None:
+    latency = estop.estop(setting, 3, real=real)
     assert latency.unconfirmed == 0
     assert len(latency.frames) == 3
     assert all(0 < frame <= answer for frame, answer in zip(latency.frames, latency.answers, strict=True))
