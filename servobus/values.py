@@ -38,6 +38,7 @@ class EventName(Described):
     ECHO_PROBED = "echo_probed", "The bus found out whether the line echoes what it sends.", "bus echo"
     SERVO_ONLINE = "servo_online", "The node answers again.", "bus servo id"
     SERVO_DOUBTFUL = "servo_doubtful", "A reply of the node is missing or came unasked.", "bus servo id"
+    SERVO_FAILING = "servo_failing", "The node answers, and refuses what the polls ask, for this reason.", "bus servo id reason"
     SERVO_OFFLINE = "servo_offline", "The node missed several replies in a row.", "bus servo id"
     SERVO_MISSING = "servo_missing", "A configured node did not answer when the line was opened.", "bus servo id reason"
     SERVO_NOTE = "servo_note", "A setting of the servo does not fit the config.", "bus servo note"
@@ -72,11 +73,13 @@ class Outcome(StrEnum):
 class Health(Described):
     """Whether a node answers.
 
-    ONLINE: it answers. DOUBTFUL: a reply is missing or came unasked. OFFLINE: it missed several replies in a row.
+    ONLINE: it answers. DOUBTFUL: a reply is missing or came unasked. FAILING: it refuses what it is asked. OFFLINE: it missed
+    several replies in a row.
     """
 
     ONLINE = "online", "The node answers what it is asked."
     DOUBTFUL = "doubtful", "A reply is missing or came unasked; a fence comes before the next request to the node."
+    FAILING = "failing", "The node answers, and has refused what the polls ask several times in a row."
     OFFLINE = "offline", "The node missed several replies in a row; it is probed with growing pauses, and nothing waits for it."
 
 

@@ -131,7 +131,7 @@ class ServoRecord:
             enabled=self.enabled,
             faults=faults,
             status=status if self.node.status is None else self.node.status,
-            health=self.node.health,
+            health=self.node.shown_health,
             time=time,
             age=None if time is None else now - time,
         )

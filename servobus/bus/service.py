@@ -19,7 +19,7 @@ from servobus.bus.requests import BusParts, EmitEvent, Requests
 from servobus.bus.stops import Stops
 from servobus.engine.duplex import DuplexEngine
 from servobus.engine.engine import Engine
-from servobus.engine.health import MAX_ALLOWANCE, OFFLINE, ONLINE, Node, NodeTable
+from servobus.engine.health import FAILING, OFFLINE, ONLINE, Node, NodeTable
 from servobus.engine.line import EchoFilter, Line
 from servobus.engine.scheduler import Scheduler
 from servobus.engine.stats import BusStats, Counter
@@ -45,8 +45,8 @@ class BusService:
         self.line = Line(traits)
         if options.echo == "on":
             self.line.echo = EchoFilter()
-        max_allowance_s = MAX_ALLOWANCE if options.timeout_ms is None else options.timeout_ms / 1000
-        self.nodes = NodeTable(set(driver.nodes.values()), max_allowance_s=max_allowance_s, changed=self._node_changed)
+        timeout_s = None if options.timeout_ms is None else options.timeout_ms / 1000
+        self.nodes = NodeTable(set(driver.nodes.values()), timeout_s=timeout_s, changed=self._node_changed)
         self.records = {
             servo: ServoRecord(servo, each, self.nodes.node(driver.nodes[servo])) for servo, each in _servos(options).items()
         }
@@ -155,8 +155,10 @@ class BusService:
         }
         nodes = {
             str(node.id): {
-                "health": node.health.value,
+                "health": node.shown_health.value,
+                **({"reason": node.failing} if node.failing else {}),
                 "misses": node.misses,
+                "causes": {cause.value: count for cause, count in node.causes.items() if count},
                 "deadline_ms": round(1e3 * node.reply_allowance_s, 3),
             }
             for node in self.nodes.by_id.values()
@@ -219,9 +221,11 @@ class BusService:
             self.stops.node_online(node)
         else:
             self.scheduler.goals.verification.forget(record.name for record in self.parts.on(node))
-        if OFFLINE in (node.health, before):
+        shown = node.shown_health
+        if OFFLINE in (node.health, before) or FAILING in (shown, before):
             names = ",".join(record.name for record in self.parts.on(node))
-            self.emit(EventName(f"servo_{node.health}"), bus=self.name, servo=names, id=node.id)
+            reason = {"reason": node.failing} if shown is FAILING else {}
+            self.emit(EventName(f"servo_{shown}"), bus=self.name, servo=names, id=node.id, **reason)
         self.discovery.node_changed(node, before)
 
 

@@ -31,7 +31,7 @@ from servobus.engine.job import Job, JobKind
 from servobus.engine.line import QUIET, Line
 from servobus.engine.runner import JobRunner
 from servobus.engine.scheduler import Scheduler
-from servobus.engine.stats import BusStats, Counter
+from servobus.engine.stats import BusStats, Cause, Counter
 from servobus.engine.turn import Transmit, Turn, Window, judge
 from servobus.errors import LinkDown, ReplyTimeout
 from servobus.protocols.base import Codec, Reply, Request
@@ -79,6 +79,10 @@ class Engine:
         """The job of a frame to which no reply is due, and which is being handed over now."""
         self._buffering = False
         """The codec was given bytes since it was reset."""
+        self._skipped_before = 0
+        """What the codec had skipped when it was reset."""
+        self._foreign: tuple[Turn, Cause] | None = None
+        """A turn in which a stray arrived, and what that tells about it."""
 
     def __repr__(self) -> str:
         servos = sum(node.configured for node in self.nodes.by_id.values())
@@ -155,9 +159,7 @@ class Engine:
         reason = str(cause) if cause else "closed"
         for job in dict.fromkeys(begun):
             if job is not None:
-                applied = ": it may have been applied" if job.changes else ""
-                message = f"the line went down while this was under way ({reason}){applied}"
-                job.fail(LinkDown(message, bus=self.bus))
+                job.fail(LinkDown(f"the line went down while this was under way ({reason}){job.applied}", bus=self.bus))
         self.scheduler.drop(
             lambda _: LinkDown(f"the line went down ({reason}): nothing was sent", bus=self.bus), motion_only=False
         )
@@ -239,6 +241,7 @@ class Engine:
     def _reset_codec(self) -> None:
         self._codec.reset()
         self._buffering = False
+        self._skipped_before = self._codec.skipped
 
     # What is received
 
@@ -281,6 +284,7 @@ class Engine:
         """Discard bytes that came while no reply was due, or before the request had left, and wait for silence before the next
         frame. The nodes of valid frames among them become doubtful."""
         self.stats.counts[Counter.UNSOLICITED_BYTES] += len(data)
+        self.line.greeted(data)
         self._codec.receive_data(data)
         strays: list[Reply] = []
         while (reply := self._codec.next_reply()) is not None:
@@ -296,7 +300,11 @@ class Engine:
             self.stats.counts[Counter.STRAYS] += 1
             node = self.nodes.node(reply.node)
             node.late(reply.key, now)
-            if node.configured or (turn is not None and reply.node in turn.request.nodes):
+            node.causes[Cause.LATE] += 1
+            asked = turn is not None and reply.node in turn.request.nodes
+            if turn is not None:
+                self._foreign = turn, Cause.LATE if asked else Cause.FOREIGN
+            if node.configured or asked:
                 self.nodes.doubt(node, reply.key, node.outstanding.get(reply.key, now))
 
     # How a turn ends
@@ -316,8 +324,8 @@ class Engine:
 
     def _answered(self, turn: Turn, now: float) -> None:
         """All replies are here."""
-        self._end_turn(turn)
         counts, request = self.stats.counts, turn.request
+        self._end_turn(turn)
         counts[TURNS] += 1
         if turn.echoes:
             counts[ECHOES] += turn.echoes
@@ -331,6 +339,9 @@ class Engine:
         for reply in turn.replies:
             node = by_id.get(reply.node) or self.nodes.node(reply.node)
             node.replied(reply.status, latency)
+        if request.relayed and request.is_silence(turn.replies):
+            for node_id in request.nodes:
+                self._count_miss(node_id, Cause.NO_ANSWER, turn, now)
         job = turn.job
         if job.plan is None and not job.fencing:
             if self.runner.job is job:
@@ -344,19 +355,32 @@ class Engine:
     def _missed(self, turn: Turn, now: float) -> None:
         """A reply is missing, or the window cannot be believed."""
         self._end_turn(turn)
+        cause = self._cause(turn)
         request, counts = turn.request, self.stats.counts
         counts[Counter.TIMEOUTS] += 1
         counts[ECHOES] += turn.echoes
         self.line.wait_for_silence(now, max(QUIET, request.quiet_after))
         rejected = turn.complete()
         for node_id in request.nodes if rejected else turn.missing():
-            self.nodes.missed(self.nodes.node(node_id), request.reply_key, turn.sent_at, now)
+            self._count_miss(node_id, cause, turn, now)
         if request.partial and turn.replies and not rejected:
             for reply in turn.replies:  # how soon they came is not known: the deadline ended this turn
                 self.nodes.node(reply.node).answered(reply.status)
             self.runner.conclude(turn.job, request, turn.replies)
         else:
-            self.runner.retry(turn, now)
+            self.runner.retry(turn, cause, now)
+
+    def _count_miss(self, node_id: int, cause: Cause, turn: Turn, now: float) -> None:
+        node = self.nodes.node(node_id)
+        node.causes[cause] += 1
+        self.nodes.missed(node, turn.request.reply_key, turn.sent_at, now)
+
+    def _cause(self, turn: Turn) -> Cause:
+        """Return why a turn has no value, from what arrived in it."""
+        if self._foreign is not None and self._foreign[0] is turn:
+            return self._foreign[1]
+        garbage = self._buffering and self._codec.skipped + self._codec.pending > self._skipped_before
+        return Cause.GARBLED if garbage else Cause.SILENT
 
     def _end_turn(self, turn: Turn) -> None:
         self._turn = None

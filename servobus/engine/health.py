@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable
 
+from servobus.engine.stats import Cause
 from servobus.values import Health
 
 FIRST_ALLOWANCE = 0.020
@@ -18,6 +19,8 @@ MIN_ALLOWANCE = 0.005
 MAX_ALLOWANCE = 0.100
 OFFLINE_AFTER = 3
 """Misses in a row."""
+FAILING_AFTER = 3
+"""Polls in a row that were refused."""
 FIRST_BACKOFF = 0.050
 MAX_BACKOFF = 3.2
 MAX_OWED_BACKOFF = 0.4
@@ -25,17 +28,20 @@ MAX_OWED_BACKOFF = 0.4
 MAX_OUTSTANDING = 64
 
 # Looking a member up in its enum is a Python call, and some of these are read in every turn.
-ONLINE, DOUBTFUL, OFFLINE = Health.ONLINE, Health.DOUBTFUL, Health.OFFLINE
+ONLINE, DOUBTFUL, FAILING, OFFLINE = Health.ONLINE, Health.DOUBTFUL, Health.FAILING, Health.OFFLINE
 
 
 class Node:
     """One node: its health, how soon it replies, and the replies that may still be under way."""
 
     __slots__ = (
+        "_first_allowance_s",
         "_mean",
         "_spread",
         "backoff",
+        "causes",
         "configured",
+        "failing",
         "health",
         "id",
         "max_allowance_s",
@@ -43,15 +49,16 @@ class Node:
         "next_probe",
         "outstanding",
         "owes_stop",
+        "refusals",
         "reply_allowance_s",
         "status",
     )
 
-    def __init__(self, node_id: int, *, configured: bool, max_allowance_s: float) -> None:
+    def __init__(self, node_id: int, *, configured: bool, first_allowance_s: float, max_allowance_s: float) -> None:
         self.id = node_id
         self.configured = configured
         self.max_allowance_s = max_allowance_s
-        self.reply_allowance_s = min(FIRST_ALLOWANCE, max_allowance_s)
+        self.reply_allowance_s = self._first_allowance_s = first_allowance_s
         """Seconds that its reply may take beyond the wire time."""
         self.health = DOUBTFUL
         self.status: int | None = None
@@ -60,6 +67,12 @@ class Node:
         """reply_key of each missing reply -> request time, oldest first."""
         self.owes_stop = False
         """A stop of a servo of this node is not confirmed yet."""
+        self.refusals = 0
+        """Polls in a row that were refused."""
+        self.failing = ""
+        """Why its polls are refused; empty: they are not."""
+        self.causes = dict.fromkeys(Cause, 0)
+        """How often a request of it had no value, by cause."""
         self.misses = 0
         self.backoff = 0.0
         self.next_probe = 0.0
@@ -114,7 +127,7 @@ class Node:
             self.next_probe = now
             return
         self.health = OFFLINE
-        self.reply_allowance_s = min(FIRST_ALLOWANCE, self.max_allowance_s)
+        self.reply_allowance_s = self._first_allowance_s
         longest = MAX_OWED_BACKOFF if self.owes_stop else MAX_BACKOFF
         self.backoff = min(2 * self.backoff, longest) if self.backoff else FIRST_BACKOFF
         self.next_probe = now + self.backoff
@@ -140,6 +153,22 @@ class Node:
         if owed and self.health is OFFLINE:
             self.next_probe = min(self.next_probe, now + MAX_OWED_BACKOFF)
 
+    @property
+    def shown_health(self) -> Health:
+        """Its health as people see it: a node that refuses is not well, though it answers."""
+        return FAILING if self.failing and self.health is ONLINE else self.health
+
+    def refused(self, reason: str) -> None:
+        """Note that it refused a poll."""
+        self.refusals += 1
+        if self.refusals >= FAILING_AFTER:
+            self.failing = reason
+
+    def accepted(self) -> None:
+        """Note that it answered a poll with values."""
+        self.refusals = 0
+        self.failing = ""
+
     def suspect(self) -> None:
         """Doubt the node because the line was lost."""
         if self.health is ONLINE:
@@ -152,9 +181,12 @@ class NodeTable:
     """The nodes of one bus. `changed(node, before)` is called after every change of a node's health."""
 
     def __init__(
-        self, nodes: Collection[int], *, max_allowance_s: float = MAX_ALLOWANCE, changed: Callable[[Node, Health], None]
+        self, nodes: Collection[int], *, timeout_s: float | None = None, changed: Callable[[Node, Health], None]
     ) -> None:
-        self._max_allowance_s = max_allowance_s
+        """`timeout_s`: the longest wait for a reply beyond its wire time, from the first request on; None: it is learned, and no
+        longer than `MAX_ALLOWANCE`."""
+        self._max_allowance_s = MAX_ALLOWANCE if timeout_s is None else timeout_s
+        self._first_allowance_s = FIRST_ALLOWANCE if timeout_s is None else timeout_s
         self._changed = changed
         self.by_id: dict[int, Node] = {}
         self.troubled: dict[int, Node] = {}
@@ -181,6 +213,23 @@ class NodeTable:
         node.fenced()
         self._report(node, before)
 
+    def refused(self, node: Node, reason: str) -> None:
+        """Note that a node refused a poll."""
+        before = node.shown_health
+        node.refused(reason)
+        self._report_failing(node, before)
+
+    def accepted(self, node: Node) -> None:
+        """Note that a node answered a poll with values."""
+        if node.refusals:
+            before = node.shown_health
+            node.accepted()
+            self._report_failing(node, before)
+
+    def _report_failing(self, node: Node, before: Health) -> None:
+        if node.shown_health is not before:
+            self._changed(node, before)
+
     def suspect_all(self) -> None:
         """Doubt every node because the line was lost."""
         for node in self.by_id.values():
@@ -204,7 +253,12 @@ class NodeTable:
         return min((node.next_probe for node in self.troubled.values()), default=None)
 
     def _add(self, node_id: int, *, configured: bool) -> Node:
-        node = Node(node_id, configured=configured, max_allowance_s=self._max_allowance_s)
+        node = Node(
+            node_id,
+            configured=configured,
+            first_allowance_s=self._first_allowance_s,
+            max_allowance_s=self._max_allowance_s,
+        )
         if configured:
             self.troubled[node_id] = node
         else:

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
+from servobus.engine.stats import Cause
 from servobus.errors import ReplyTimeout
 from servobus.protocols.base import Plan, Request
 
@@ -99,6 +100,7 @@ class Job:
         "_fence",
         "_resume",
         "attempts",
+        "cause",
         "changes",
         "even_if_offline",
         "expires",
@@ -149,6 +151,8 @@ class Job:
         """How often the present request was sent in vain."""
         self.changes = request is not None and request.changes
         """It has asked for a change, which may be done where it fails."""
+        self.cause: Cause | None = None
+        """Why its present request has no value yet."""
         self.fencing = kind is JobKind.PROBE
         """Its present request belongs to a fence."""
         self._fence: Plan[bool] | None = None
@@ -173,6 +177,11 @@ class Job:
         """One request, and no fence is under way before it."""
         return self.plan is None and not self.fencing
 
+    @property
+    def applied(self) -> str:
+        """The end of a message about a job that was begun: whether it may have changed something."""
+        return "; it may have been applied" if self.changes else ""
+
     def begin(self) -> Step:
         """Return the first step."""
         return Send(self.request) if self.plan is None else self._in_plan(_send(self.plan, None))
@@ -195,7 +204,7 @@ class Job:
         return Failed(error) if self.plan is None else self._in_plan(_throw(self.plan, error))
 
     def _in_plan(self, step: Step) -> Step:
-        self.attempts = 0
+        self.attempts, self.cause = 0, None
         if isinstance(step, Send):
             self.request = request = step.request
             self.changes = self.changes or request.changes

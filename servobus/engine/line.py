@@ -15,6 +15,8 @@ START_QUIET = 0.020
 """The same after opening: a servo may still be answering another master, or hold half a frame."""
 BABBLE = 0.250
 """Seconds without silence after which what arrives is no late reply any more."""
+MAX_GREETING = 64
+"""Bytes of a greeting that are kept."""
 ECHO_LIMIT = 4096
 """Bytes of our own whose echo may be outstanding."""
 
@@ -55,12 +57,14 @@ class Line:
     """The state of one half-duplex line as its master knows it."""
 
     __slots__ = (
+        "_opened_at",
         "_waiting_since",
         "babbling",
         "byte_time",
         "drains",
         "echo",
         "gap",
+        "greeting",
         "last_start",
         "paced",
         "quiet_until",
@@ -85,6 +89,9 @@ class Line:
         self.quiet_until = 0.0
         """Until then nothing is transmitted."""
         self.waiting_for_silence = False
+        self.greeting = b""
+        """The first bytes that arrived since it was opened, before anything was sent."""
+        self._opened_at = 0.0
         self._waiting_since = 0.0
 
     def use(self, traits: LineTraits) -> None:
@@ -95,11 +102,17 @@ class Line:
         self.paced = traits.paced
 
     def opened(self, now: float) -> None:
-        self.sent_by = self.last_start = now
+        self.sent_by = self.last_start = self._opened_at = now
+        self.greeting = b""
         self.waiting_for_silence = False
         self.quiet_until = 0.0
         self.babbling = False
         self.wait_for_silence(now, START_QUIET)
+
+    def greeted(self, data: bytes) -> None:
+        """Keep bytes that arrived unasked, if nothing was sent yet: they tell what is at the other end."""
+        if self.sent_by <= self._opened_at:
+            self.greeting = (self.greeting + data)[:MAX_GREETING]
 
     def wait_for_silence(self, now: float, quiet: float = QUIET) -> None:
         """Transmit nothing until `quiet` seconds passed without a byte. A longer silence that is due already is kept."""

@@ -124,8 +124,7 @@ def _drop(job: Job) -> None:
 def _too_late(job: Job) -> ReplyTimeout:
     request = None if job.plan is not None else job.request
     if job.attempts:
-        applied = ": it may have been applied" if job.changes else ""
-        message = f"no reply, and no time to send the request again{applied}"
+        message = f"no reply, and no time to send the request again{job.applied}"
     else:
         message = "the request waited too long for its turn: the line is busier than it can carry (`servobus check`)"
     return ReplyTimeout(message, request=request, raw=b"" if request is None else request.frame)

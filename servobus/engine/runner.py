@@ -19,12 +19,19 @@ from typing import Any
 from servobus.engine.health import OFFLINE, ONLINE, Node, NodeTable
 from servobus.engine.job import Done, Failed, Job, JobKind, NodeRestarted, Step
 from servobus.engine.scheduler import Scheduler
-from servobus.engine.stats import BusStats, Counter
+from servobus.engine.stats import BusStats, Cause, Counter
 from servobus.engine.turn import Turn
-from servobus.errors import EStopped, NotEnabled, ReplyTimeout, ServobusError
+from servobus.errors import DeviceError, EStopped, NotEnabled, ReplyTimeout, ServobusError
 from servobus.protocols.base import Reply, Request
 
 ESTOP = JobKind.ESTOP
+TIMEOUTS = {
+    Cause.SILENT: ("no answer", "is it powered, are id and baud rate right?"),
+    Cause.GARBLED: ("garbled replies", "are there two servos with this id, another baud rate, or noise on the line?"),
+    Cause.FOREIGN: ("only replies of other nodes", "does a second program or master use the line?"),
+    Cause.LATE: ("only a late reply", "it is slower than expected: set timeout_ms of the bus"),
+}
+"""Cause -> what happened, and the next step."""
 
 
 class JobRunner:
@@ -108,6 +115,9 @@ class JobRunner:
         try:
             value = request.parse(replies)
         except Exception as error:  # noqa: BLE001 - a mistake in a driver ends its job, never the bus
+            if isinstance(error, DeviceError):
+                for node_id in request.nodes:
+                    self.nodes.node(node_id).causes[Cause.REFUSED] += 1
             self._apply(job, job.give_up(error))
             return
         if job.plan is None and not job.fencing:
@@ -134,10 +144,12 @@ class JobRunner:
         elif error is not None:
             job.fail(error.at(bus=self.bus) if isinstance(error, ServobusError) else error)
 
-    def retry(self, turn: Turn, now: float) -> None:
-        """Send the request once more, or give it up: case 3 above."""
+    def retry(self, turn: Turn, cause: Cause, now: float) -> None:
+        """Send the request once more, or give it up: case 3 above. `cause`: why it has no value."""
         job, request = turn.job, turn.request
         job.attempts += 1
+        if job.cause is None or cause is not Cause.SILENT:
+            job.cause = cause
         offline = any(self.nodes.node(node).health is OFFLINE for node in request.nodes)
         too_late = job.kind is JobKind.MOTION and now >= job.expires
         # The request of a fence is not repeated as it was: its reply may still come, and must be fenced again.
@@ -153,10 +165,8 @@ class JobRunner:
 
     def _timeout(self, job: Job, request: Request[Any]) -> ReplyTimeout:
         tries = "1 try" if job.attempts == 1 else f"{job.attempts} tries"
-        message = f"no answer after {tries}: is it powered, are id and baud rate right?"
-        if job.changes:
-            message += " What was asked may have been applied"
-        return ReplyTimeout(message, bus=self.bus, request=request, raw=request.frame)
+        problem, step = TIMEOUTS[job.cause or Cause.SILENT]
+        return ReplyTimeout(f"{problem} after {tries}: {step}{job.applied}", bus=self.bus, request=request, raw=request.frame)
 
     def estopped(self, servo: str) -> ServobusError:
         return EStopped("the e-stop came first: nothing more was sent", bus=self.bus, servo=servo or None)

@@ -298,8 +298,19 @@ class Scheduler:
         while (poll := self.polls.take(now)) is not None:
             request = poll.request(self.nodes.reachable())
             if request is not None:
-                return Job(Callback(self._on_update), now + POLL_PATIENCE, request=request, tries=1)
+                sink = Callback(partial(self._polled, request.nodes))
+                return Job(sink, now + POLL_PATIENCE, request=request, tries=1)
         return None
+
+    def _polled(self, nodes: Sequence[int], result: Any) -> None:
+        """A poll has ended. A node that refuses it is not well, though it answers."""
+        if len(nodes) == 1:
+            node = self.nodes.node(nodes[0])
+            if isinstance(result, DeviceError):
+                self.nodes.refused(node, result.message)
+            elif not isinstance(result, Exception):
+                self.nodes.accepted(node)
+        self._on_update(result)
 
     def _next_probe(self, now: float) -> Job | None:
         node = self.nodes.due_probe(now)

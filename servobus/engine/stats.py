@@ -41,6 +41,17 @@ class Counter(Described):
     GOAL_GROUPS_SPLIT = "goal_groups_split", "Groups of goals that did not fit one plan."
 
 
+class Cause(Described):
+    """Why a request has no value: counted for each node, and named in the error."""
+
+    SILENT = "silent", "Nothing arrived."
+    GARBLED = "garbled", "Bytes arrived that are no valid reply."
+    FOREIGN = "foreign", "Valid replies of other nodes arrived, and none of this one."
+    LATE = "late", "A reply arrived after its request was given up, or twice."
+    NO_ANSWER = "no_answer", "A gateway reported that the node did not answer it."
+    REFUSED = "refused", "The node answered, and refused."
+
+
 class Histogram:
     """Durations in buckets of logarithmic width, from a microsecond up; its size never grows.
 

@@ -88,6 +88,8 @@ class Request(ABC, Generic[R]):
     """Seconds the device may need beyond its usual delay (flash write, reboot)."""
     mirrored: bool = False
     """The right reply has the same bytes as the request: only for lines that are known to have no echo."""
+    relayed: bool = False
+    """A gateway may reply in the node's name: see `is_silence`."""
     partial: bool = False
     """Fewer replies than due are a result too: the missing nodes become doubtful, the others are believed."""
 
@@ -98,6 +100,10 @@ class Request(ABC, Generic[R]):
     @abstractmethod
     def parse(self, replies: Sequence[Any]) -> R:
         """Return the value of the replies, which are in the order received. Raises DeviceError or EchoMismatch."""
+
+    def is_silence(self, replies: Sequence[Any]) -> bool:
+        """Return whether these replies, of a `relayed` request, say that the node did not answer the gateway."""
+        return False
 
     def whole_reply(self, data: bytes) -> Any:
         """Return the reply if these bytes are exactly the one reply that is due; None: the codec has to decide.

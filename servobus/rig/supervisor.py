@@ -26,6 +26,9 @@ from servobus.values import EventName, StopReport
 Trace = Callable[[str, bool, bytes, float], None]  # (bus, sent, bytes, monotonic seconds) of everything on the wire
 
 RETRY = 0.1  # seconds between two attempts to open a port
+EARLY = 1.0  # a line that ends sooner than this cannot be used: the next attempts have growing pauses
+MAX_PAUSE = 3.2  # seconds, the longest of them
+TELNET, TELNET_VERBS = 0xFF, range(0xFB, 0xFF)  # IAC, and WILL to DONT (RFC 854)
 EXIT_TIMEOUT = 1.0  # seconds that the exit policies may take, besides parking
 
 
@@ -50,6 +53,7 @@ class BusSupervisor:
         self.tried = asyncio.Event()  # set once the line was opened, or could not be
         self.down: LinkDown | None = None
         self.scope = anyio.CancelScope()
+        self._pause = 0.0  # seconds before the next attempt, after a line that ended early
         self._event = event
 
     async def run(self, degraded: bool) -> None:
@@ -70,6 +74,12 @@ class BusSupervisor:
             self.tried.set()
             await anyio.sleep(RETRY)
             return
+        opened_at = self.bus.clock()
+        if self._pause:  # the last line ended early: nothing is said before this one has lived longer
+            with anyio.move_on_after(EARLY):
+                await self.bus.master.wait_closed()
+                await self._ended_early()
+                return
         self.down = None
         self.bus.line.use(self.link.traits)  # a tunnel knows its limits only now
         self._event(EventName.LINE_UP, bus=self.name, port=self.link.address)
@@ -77,6 +87,19 @@ class BusSupervisor:
         self.tried.set()
         await self.bus.master.wait_closed()
         self._event(EventName.LINE_DOWN, bus=self.name, port=self.link.address)
+        if self.bus.clock() - opened_at < EARLY:
+            await self._ended_early()
+        else:
+            self._pause = 0.0
+
+    async def _ended_early(self) -> None:
+        """Say once that the line ends as soon as it is opened, and wait before the next attempt, longer each time."""
+        error = LinkDown(f"{self.link.address} opens and ends at once{_greeted(self.bus.line.greeting)}")
+        if str(error) != str(self.down):
+            self._event(EventName.WAITING_FOR_PORT, bus=self.name, port=self.link.address, reason=error.message)
+        self.down = error
+        self._pause = min(2 * self._pause, MAX_PAUSE) or RETRY
+        await anyio.sleep(self._pause)
 
     def enabled(self, policy: str, kind: str) -> list[ServoRecord]:
         """The enabled servos whose `policy` (on_estop, on_exit, on_lost_client) is this kind."""
@@ -131,3 +154,13 @@ def why_not_to_close(buses: Mapping[str, BusSupervisor], *, force: bool) -> str:
         return ""
     what = f"the new config closes or opens again {', '.join(buses)}"
     return f"{what}, while these servos are enabled or owe a stop: {', '.join(servos)}; disable them first, or force it"
+
+
+def _greeted(greeting: bytes) -> str:
+    """What the first bytes of the other end tell, and the next step."""
+    if any(bytes((TELNET, verb)) in greeting for verb in TELNET_VERBS):
+        return ": it negotiates telnet: set the server's port to raw TCP"
+    if greeting:
+        text = greeting.decode("ascii", "backslashreplace").strip()
+        return f": its greeting is {text!r}: is this the port of a serial line, and is another program connected to it?"
+    return ": is another program connected to it, or is it another kind of server?"

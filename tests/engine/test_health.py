@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from servobus.engine.health import (
+    FAILING_AFTER,
     FIRST_ALLOWANCE,
     FIRST_BACKOFF,
     MAX_ALLOWANCE,
@@ -23,9 +24,9 @@ ONLINE, DOUBTFUL, OFFLINE = Health.ONLINE, Health.DOUBTFUL, Health.OFFLINE
 class Watched:
     """The health of nodes 1 and 2, and all changes that were reported."""
 
-    def __init__(self, *, online: bool = True, max_allowance_s: float = MAX_ALLOWANCE) -> None:
+    def __init__(self, *, online: bool = True, timeout_s: float | None = None) -> None:
         self.changes: list[tuple[int, Health, Health]] = []
-        self.nodes = NodeTable((1, 2), max_allowance_s=max_allowance_s, changed=self._changed)
+        self.nodes = NodeTable((1, 2), timeout_s=timeout_s, changed=self._changed)
         if online:
             self.nodes.fenced(self.node)
             self.nodes.fenced(self.nodes.node(2))
@@ -46,9 +47,13 @@ class Watched:
 # Allowances
 
 
-def test_a_node_that_never_replied_has_the_first_allowance_or_less() -> None:
+def test_the_first_request_waits_as_long_as_the_config_says() -> None:
     assert Watched().node.reply_allowance_s == FIRST_ALLOWANCE
-    assert Watched(max_allowance_s=0.01).node.reply_allowance_s == 0.01
+    for timeout_s in (0.01, 1.0):
+        watched = Watched(timeout_s=timeout_s)
+        assert watched.node.reply_allowance_s == timeout_s
+        watched.miss(OFFLINE_AFTER)
+        assert watched.node.reply_allowance_s == timeout_s, "and so does the first one after it was offline"
 
 
 def test_the_allowance_is_learned_and_stays_within_its_bounds() -> None:
@@ -81,15 +86,17 @@ def test_an_answer_that_came_before_it_could_counts_as_immediate() -> None:
 
 
 def test_the_maximum_of_a_config_holds_even_below_the_minimum() -> None:
-    node = Watched(max_allowance_s=0.002).node
+    node = Watched(timeout_s=0.002).node
     node.learn(0.0001)
     assert node.reply_allowance_s == 0.002
 
 
 def test_a_miss_doubles_the_allowance_up_to_the_maximum() -> None:
-    watched = Watched(max_allowance_s=0.03)
+    watched = Watched(timeout_s=0.03)
+    watched.node.learn(0.01)
+    watched.node.learn(0.01)
     watched.miss()
-    assert watched.node.reply_allowance_s == 0.03, "twice 20 ms is more than is allowed"
+    assert watched.node.reply_allowance_s == 0.03, "twice what was learned is more than is allowed"
     watched = Watched()
     watched.miss()
     assert watched.node.reply_allowance_s == 2 * FIRST_ALLOWANCE
@@ -248,3 +255,26 @@ def test_after_the_line_was_gone_everybody_is_asked_before_being_believed() -> N
     assert watched.nodes.next_probe() == 0.0
     assert watched.node.next_probe == second.next_probe == 0.0
     assert second.outstanding, "what was under way may come yet"
+
+
+# Refusals
+
+
+def test_a_node_that_refuses_its_polls_is_failing_with_the_reason() -> None:
+    watched = Watched()
+    for _ in range(FAILING_AFTER):
+        assert watched.node.shown_health is ONLINE
+        watched.nodes.refused(watched.node, "busy")
+    assert (watched.node.shown_health, watched.node.failing) == (Health.FAILING, "busy")
+    assert watched.node.health is ONLINE, "it answers: it needs no fence"
+    watched.nodes.accepted(watched.node)
+    assert watched.node.shown_health is ONLINE
+    assert [change[1] for change in watched.changes] == [ONLINE, Health.FAILING]
+
+
+def test_a_failing_node_that_falls_silent_is_doubtful() -> None:
+    watched = Watched()
+    for _ in range(FAILING_AFTER):
+        watched.nodes.refused(watched.node, "busy")
+    watched.miss()
+    assert watched.node.shown_health is DOUBTFUL

@@ -123,6 +123,8 @@ class Fence(KstRequest[None]):
 class SetValue(KstRequest[None]):
     """A set command, whose reply repeats its data (KST RS422, 3.1, 3.2, 3.5)."""
 
+    changes = True
+
     def __init__(self, settings: RequestSettings, node: int, command: Command, data: bytes, *, also: int | None = None) -> None:
         """`also`: another address from which the reply may come."""
         super().__init__(settings, node, command, data)
@@ -149,6 +151,7 @@ class Save(KstRequest[None]):
     """Save, where a reply is waited for (KST RS422, 3.3). Never repeated, because it wears the flash."""
 
     idempotent = False
+    changes = True
 
     def __init__(self, settings: RequestSettings, node: int) -> None:
         super().__init__(settings, node, Command.SAVE, SAVE_DATA)

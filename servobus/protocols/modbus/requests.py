@@ -78,6 +78,11 @@ class ModbusRequest(Request[R]):
         self.reply_key = codec.reply_key(function, repeated)
         self.quiet_after = timing.gap if self.replies else timing.gap + timing.turnaround
 
+    relayed = True
+
+    def is_silence(self, replies: Sequence[Frame]) -> bool:
+        return bool(replies) and replies[0].function & REFUSED != 0 and replies[0].data[0] in GATEWAY
+
     def answers(self, reply: Frame) -> bool:
         return reply.unit == self.node and (self._matches(reply) or reply.function == self.function | REFUSED)
 
@@ -135,6 +140,9 @@ class UnitRead(ReadHolding[R]):
 class PresenceRead(UnitRead[R | None]):
     """A read that shows whether the unit is there. A refusal by the unit shows it too (None)."""
 
+    def answers(self, reply: Frame) -> bool:
+        return super().answers(reply) and not (reply.function & REFUSED and reply.data[0] in GATEWAY)
+
     def parse(self, replies: Sequence[Frame]) -> R | None:
         return None if replies[0].function & REFUSED else super().parse(replies)
 
@@ -162,6 +170,7 @@ class WriteSingle(ModbusRequest[None]):
     """0x06: writes one register. Only for lines without an echo, because the correct reply equals the request."""
 
     mirrored = True
+    changes = True
 
     def __init__(self, timing: RtuTiming, unit: int, address: int, value: int, *, repeat: bool = True) -> None:
         """`repeat`: it may be sent again when no reply came."""
@@ -173,6 +182,8 @@ class WriteSingle(ModbusRequest[None]):
 class WriteMultiple(ModbusRequest[None]):
     """0x10: writes registers from `address` on. A unit may stop at the first one it refuses, so a refused write may be applied in
     part."""
+
+    changes = True
 
     def __init__(self, timing: RtuTiming, unit: int, address: int, values: Sequence[int], *, repeat: bool = True) -> None:
         """`repeat`: it may be sent again when no reply came. Raises ValueError outside 1 to 123 values."""

@@ -153,6 +153,8 @@ class Fence(Read[bytes]):
 class Acknowledged(SmsRequest[int | None]):
     """An instruction whose reply, if one is due, has no parameters; its value is the health byte."""
 
+    changes = True
+
     def parse(self, replies: Sequence[Packet]) -> int | None:
         return replies[0].code if replies else None
 

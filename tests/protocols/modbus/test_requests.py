@@ -156,6 +156,8 @@ def test_a_units_refusal_shows_it_is_there_and_a_gateways_does_not() -> None:
         assert probe.parse([refused]) is None
     for code in (0x0A, 0x0B):
         assert not probe.answers(frame(encode(2, 0x83, bytes((code,)))))
+        assert read(1000, 1).is_silence([frame(encode(2, 0x83, bytes((code,))))])
+    assert not read(1000, 1).is_silence([refused])
 
 
 def test_a_gateways_refusal_is_silence_where_only_the_unit_itself_may_answer() -> None:
