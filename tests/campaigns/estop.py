@@ -66,8 +66,9 @@ class Latency:
     """Servos that are alive and were not confirmed."""
 
     def report(self) -> None:
+        kind = "real time" if self.real else "wire alone"
         print(
-            f"{self.setting.name:38} {'real time' if self.real else 'wire alone'}: last byte {_three(self.frames)}; confirmed {_three(self.answers)} ms; "
+            f"{self.setting.name:38} {kind:10} last byte {_three(self.frames)}; confirmed {_three(self.answers)} ms; "
             f"{len(self.frames)} e-stops, {self.unconfirmed} not confirmed"
         )
 
