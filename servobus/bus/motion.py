@@ -27,6 +27,8 @@ FRESH = 0.1
 """Seconds for which a position is good enough to be where a motion starts."""
 SESSION = "a scan or commissioning session has this bus: wait until it ends"
 SETTLE_PERIOD = 0.02
+OTHERS_PATIENCE = 20.0
+"""Seconds for which an enable or a disable waits for those of the other servos: each takes some turns, and a pause."""
 _batches = itertools.count(1)
 # Looking a member up in its enum is a Python call, and these are needed for every goal.
 GOALS, SUPERSEDED = Counter.GOALS, Outcome.SUPERSEDED
@@ -175,7 +177,9 @@ class Motion:
             record.enabled = False
             record.touched = True  # also when this is cancelled or fails half-way
             plan = self._parts.driver.enable(servo)
-            present = await self._requests.perform(plan, record.node.id, servo=servo, kind=JobKind.MOTION)
+            present = await self._requests.perform(
+                plan, record.node.id, servo=servo, kind=JobKind.MOTION, patience=OTHERS_PATIENCE
+            )
         finally:
             self.enabling.discard(servo)
         if self._stops.latched or self._stops.leaving:
@@ -200,7 +204,7 @@ class Motion:
         if not record.arrived(self._near(servo)):
             record.cut = NotEnabled("the servo was disabled before it arrived at its goal")
         plan = self._parts.driver.disable(servo)
-        report = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True)
+        report = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True, patience=OTHERS_PATIENCE)
         if not report.confirmed:
             message = f"torque off was written and not confirmed: {report.detail}"
             raise DeviceError(message, bus=self._parts.name, servo=servo)

@@ -87,10 +87,14 @@ class Requests:
         kind: JobKind = ORDINARY,
         even_if_offline: bool = False,
         session: object = None,
+        patience: float = PATIENCE,
     ) -> Coroutine[Any, Any, R]:
-        """Run a plan and return its result; only an e-stop comes between its frames. Raises as `ask`."""
+        """Run a plan and return its result; only an e-stop comes between its frames. Raises as `ask`.
+
+        `patience`: seconds for which it may wait for its turn.
+        """
         future: asyncio.Future[R] = self._loop.create_future()
-        expires = self._parts.clock() + PATIENCE
+        expires = self._parts.clock() + patience
         job = Job(future, expires, None, plan, node, kind, even_if_offline, session)
         return self._result(job, future, servo)
 

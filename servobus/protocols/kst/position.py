@@ -19,8 +19,8 @@ PAUSE = 0.03
 """Seconds between two readings that show whether a servo rests."""
 REST = 1
 """Steps by which they may differ: less than a servo travels meanwhile at 7 deg/s."""
-ROUNDS = 4
-"""How often a servo that still moves is read again."""
+ROUNDS = 3
+"""How often a servo that still moves is read so."""
 
 Readings = tuple[int, int] | ServobusError
 """The last two readings of a servo in steps, or why it could not be read."""
@@ -48,14 +48,15 @@ def locate(settings: RequestSettings, servo: CalibratedServo, *, once: bool = Fa
 
 
 def rest(settings: RequestSettings, servos: Sequence[CalibratedServo]) -> Plan[dict[CalibratedServo, Readings]]:
-    """Return the last two readings of each servo. One that moves meanwhile is read a few times more."""
+    """Return two readings of each servo, with a pause between. They are repeated a few times for one that moves meanwhile."""
     results: dict[CalibratedServo, Readings] = {}
-    before = yield from _read_all(settings, servos, results)
+    waiting = list(servos)
     for _ in range(ROUNDS):
+        before = yield from _read_all(settings, waiting, results, pause=PAUSE)
         now = yield from _read_all(settings, list(before), results)
         results |= {servo: (before[servo], reading) for servo, reading in now.items()}
-        before = {servo: reading for servo, reading in now.items() if not rests(results[servo])}
-        if not before:
+        waiting = [servo for servo in now if not rests(results[servo])]
+        if not waiting:
             break
     return results
 
@@ -66,14 +67,18 @@ def rests(readings: Readings) -> bool:
 
 
 def _read_all(
-    settings: RequestSettings, servos: Sequence[CalibratedServo], failed: dict[CalibratedServo, Readings]
+    settings: RequestSettings,
+    servos: Sequence[CalibratedServo],
+    failed: dict[CalibratedServo, Readings],
+    *,
+    pause: float = 0.0,
 ) -> Plan[dict[CalibratedServo, int]]:
-    """Read each servo; the line is silent after the last one."""
+    """Read each servo. `pause`: seconds of silence after the last one."""
     readings: dict[CalibratedServo, int] = {}
     for servo in servos:
         request = position_read(settings, servo)
         if servo is servos[-1]:
-            request.quiet_after = max(request.quiet_after, PAUSE)
+            request.quiet_after = max(request.quiet_after, pause)
         try:
             readings[servo] = yield from ask(request)
         except ServobusError as error:

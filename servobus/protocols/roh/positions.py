@@ -19,8 +19,8 @@ REST_STEPS = 1.0
 """Steps of a finger (0.1 % or 0.1 degrees) by which they may differ."""
 CLOSE_STEPS = 50.0
 """Steps by which two readings of a finger that moves may differ, one turn apart."""
-ROUNDS = 4
-"""How often fingers that still move are read again."""
+ROUNDS = 3
+"""How often fingers that still move are read so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,17 +63,16 @@ def _is_close(finger: Finger, expected: int | None, position: int) -> bool:
 
 
 def rest(hand: Hand, fingers: Collection[Finger]) -> Plan[dict[Finger, tuple[Reading, Reading]]]:
-    """Return the last two readings of each finger. Those that move meanwhile are read a few times more."""
+    """Return two readings of each finger, with a pause between. They are repeated a few times for those that move meanwhile."""
     waiting = list(fingers)
     results: dict[Finger, tuple[Reading, Reading]] = {}
-    before = yield from read_fingers(hand, waiting, pause=PAUSE)
     for _ in range(ROUNDS):
-        now = yield from read_fingers(hand, waiting, pause=PAUSE)
+        before = yield from read_fingers(hand, waiting, pause=PAUSE)
+        now = yield from read_fingers(hand, waiting)
         results |= {finger: (before[finger], now[finger]) for finger in waiting}
         waiting = [finger for finger in waiting if not rests(finger, *results[finger])]
         if not waiting:
             break
-        before = now
     return results
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -232,3 +232,18 @@ def test_the_bandwidth_of_a_line_is_counted_before_it_is_opened() -> None:
     # A write of six and its answer are 29 bytes, a read of six 25; each has its silence and the usual turnaround.
     assert load.shares["goals"] == pytest.approx(100 * 20 * (29 * 10 / 115_200 + 0.00175 + 0.0005))
     assert load.shares["feedback"] == pytest.approx(100 * 20 * (25 * 10 / 115_200 + 0.00175 + 0.0005))
+
+
+@virtual
+async def test_all_fingers_of_a_slow_hand_are_enabled_and_disabled_at_once() -> None:
+    """Each takes some turns and a pause, so the last one waits for seconds."""
+    async with running(HAND, behind_arm=True, poll={}) as (bus, hands, _):
+        hands[0].delay = 0.08
+        for _ in range(10):  # its deadline is learned
+            with suppress(ReplyTimeout):
+                await bus.read("index")
+        began = bus.clock()
+        await asyncio.gather(*map(bus.motion.enable, HAND))
+        assert bus.clock() - began > 3
+        assert all(bus.state(name).enabled for name in HAND)
+        await asyncio.gather(*map(bus.motion.disable, HAND))
