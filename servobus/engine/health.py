@@ -23,7 +23,7 @@ FAILING_AFTER = 3
 """Polls in a row that were refused."""
 FIRST_BACKOFF = 0.050
 MAX_BACKOFF = 3.2
-MAX_OWED_BACKOFF = 0.4
+MAX_OWED_BACKOFF = 0.2
 """The same for a node that owes a stop: it is to be stopped as soon as it can be heard."""
 MAX_OUTSTANDING = 64
 

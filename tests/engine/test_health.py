@@ -11,6 +11,7 @@ from servobus.engine.health import (
     MAX_ALLOWANCE,
     MAX_BACKOFF,
     MAX_OUTSTANDING,
+    MAX_OWED_BACKOFF,
     MIN_ALLOWANCE,
     OFFLINE_AFTER,
     Node,
@@ -203,6 +204,17 @@ def test_a_doubtful_node_is_probed_at_once_and_an_offline_one_ever_more_seldom()
     expected = [min(FIRST_BACKOFF * 2**step, MAX_BACKOFF) for step in range(9)]
     assert pauses == pytest.approx(expected)
     assert pauses[-2:] == pytest.approx([MAX_BACKOFF, MAX_BACKOFF])
+
+
+def test_a_node_that_owes_a_stop_is_probed_twice_in_the_time_that_an_exit_leaves_to_one_that_is_deaf_for_0_6_s() -> None:
+    """An exit waits 1 s for the stops that are owed."""
+    watched = Watched()
+    watched.miss(OFFLINE_AFTER + 9, now=5.0)
+    watched.node.owe_stop(5.0, owed=True)
+    assert watched.node.next_probe == 5.0 + MAX_OWED_BACKOFF
+    watched.miss(now=5.2)
+    assert watched.node.next_probe == 5.2 + MAX_OWED_BACKOFF
+    assert 2 * MAX_OWED_BACKOFF <= 1.0 - 0.6
 
 
 def test_after_it_came_back_the_backoff_starts_anew() -> None:
