@@ -89,7 +89,7 @@ class GoalWriter:
         yield request
         for part in parts:
             if part.settings:
-                part.servo.hold(part.settings)
+                part.servo.sent(part.settings, acknowledged=request.replies > 0)
         return dict.fromkeys(_names(parts), Outcome.ACKED if request.replies else Outcome.SENT)
 
     # REG WRITE and ACTION

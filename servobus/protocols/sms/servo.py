@@ -68,6 +68,8 @@ class HostServo:
         self.held: Mapping[str, int] = {}
         """Raw acceleration and torque limit as last written; a name is absent while its value is not known. The mapping is
         replaced when one changes, never changed."""
+        self._unconfirmed: Mapping[str, int] = {}
+        """Settings that were sent once in a frame that has no reply."""
         self.own: Mapping[str, int] = {}
         """Raw acceleration and torque limit that `enable` read: a goal that names none leaves the servo at them."""
         self.guard_span = self._guard_span()
@@ -101,6 +103,13 @@ class HostServo:
         """Keep what was written to the registers beside the goal."""
         if settings:
             self.held = {**self.held, **settings}
+
+    def sent(self, settings: Mapping[str, int], *, acknowledged: bool) -> None:
+        """Note that a goal brought these settings. A frame without a reply may be lost, so it has to bring them twice."""
+        if acknowledged or settings == self._unconfirmed:
+            self.hold(settings)
+            settings = {}
+        self._unconfirmed = settings
 
     def forget(self, settings: Mapping[str, int]) -> None:
         """Note that these registers are being written, so that their values are not known until the write is done."""

@@ -229,6 +229,23 @@ def test_what_a_goal_changed_does_not_outlive_enable(family: str, how: str) -> N
 
 
 @pytest.mark.parametrize("family", ["sts", "sms"])
+def test_an_effort_is_put_back_also_where_the_frame_that_does_it_gets_lost(family: str) -> None:
+    """SYNC WRITE has no reply, so it brings what it changes twice."""
+    bench = Bench({name: {"id": number, "model": family} for number, name in enumerate("ab", 1)})
+    bench.enable()
+    bench.move({name: Goal("position", 5, effort=30) for name in "ab"})
+    assert bench.register(2, "torque_limit") == 300
+    bench.is_lost = lambda packet: True
+    bench.move(dict.fromkeys("ab", 6.0))
+    bench.is_lost = lambda packet: False
+    bench.move(dict.fromkeys("ab", 7.0))
+    assert (bench.register(1, "torque_limit"), bench.register(2, "torque_limit")) == (1000, 1000)
+    bench.sent.clear()
+    bench.move(dict.fromkeys("ab", 8.0))
+    assert bench.sent[0].params[:2] == bytes((42, 6)), "then no more"
+
+
+@pytest.mark.parametrize("family", ["sts", "sms"])
 def test_an_effort_whose_acknowledgement_got_lost_is_put_back_too(family: str) -> None:
     bench = bench_of(family)
     bench.enable()
