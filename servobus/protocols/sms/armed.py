@@ -7,6 +7,9 @@ of the plan or was read as not armed. A node enters this table
 2. when its flag was read as 1: a REG WRITE of another program waits in it;
 3. before our own REG WRITE leaves, so that a plan may be closed at any frame; also after the ACTION, which has no reply.
 
+A configured node that never answered is not in the table: it may be absent, or receive all the same. While there is one, each member
+gets an ACTION of its own instead, so that a dead servo holds nobody up and nothing of it can be fired.
+
 Only what we armed ourselves is disarmed without being asked: a harmless REG WRITE replaces the goal, an ACTION to this node alone
 fires it, and the flag is read back. What another program armed, `enable` and `disable` of that servo disarm.
 """
@@ -45,6 +48,7 @@ class Armed:
     def __init__(self, servos: Mapping[str, HostServo]) -> None:
         self._servos = {servo.node: servo for servo in servos.values()}
         self._nodes: dict[int, Suspicion] = {}
+        self._answered: set[int] = set()
 
     def __contains__(self, node: int) -> bool:
         return node in self._nodes
@@ -54,10 +58,15 @@ class Armed:
         """Whether a REG WRITE of ours waits in some node, or may wait there."""
         return Suspicion.SENT in self._nodes.values()
 
+    def all_answered(self, members: Collection[int]) -> bool:
+        """Whether every configured node that is no member has answered, so that this table tells about it."""
+        return self._servos.keys() <= self._answered | set(members)
+
     # What happens to a node
 
     def suspect(self, node: int) -> None:
         """It answers, and its flag was not read since it was last in doubt."""
+        self._answered.add(node)
         self._nodes.setdefault(node, Suspicion.UNREAD)
 
     def arming(self, node: int) -> None:
@@ -70,6 +79,7 @@ class Armed:
 
     def read(self, node: int, flag: int) -> bool:
         """Note what the flag was read as; return whether the node is armed."""
+        self._answered.add(node)
         if not flag:
             self._nodes.pop(node, None)
         elif self._nodes.get(node) not in OURS:

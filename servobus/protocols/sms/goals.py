@@ -111,12 +111,27 @@ class GoalWriter:
                 results[part.servo.name] = ActionWithheld(f"not moved: {reason}", servo=part.servo.name)
                 yield from self._armed.disarm(part.servo)
             return results
-        yield from ask(Action())
-        for part in parts:
-            self._armed.fired(part.servo.node)
+        if self._armed.all_answered({part.servo.node for part in parts}):
+            yield from ask(Action())
+            for part in parts:
+                self._armed.fired(part.servo.node)
+        else:
+            results |= yield from self._fire_each(armed)
         for part in armed:
             part.servo.hold(part.settings)
         return results
+
+    def _fire_each(self, parts: Sequence[PackedGoal]) -> Plan[Results]:
+        """Send each servo an ACTION of its own, at once after one another. It is never repeated: the first may have worked."""
+        failed: Results = {}
+        for part in parts:
+            servo = part.servo
+            self._armed.fired(servo.node)
+            try:
+                yield from ask(Action(servo.node, answered=servo.answers_writes))
+            except ServobusError as error:
+                failed[servo.name] = error
+        return failed
 
     def _reg_write(self, part: PackedGoal) -> RegWrite:
         return RegWrite(part.servo.node, part.address, part.data, answered=part.servo.answers_writes)

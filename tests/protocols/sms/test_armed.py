@@ -105,6 +105,37 @@ def test_a_servo_that_is_not_configured_withholds_action_too(family: str) -> Non
     assert bench.move(GOALS, confirm=True) == ACKED
 
 
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_servo_that_never_answered_is_not_fired_and_holds_nobody_up(family: str, together: bool) -> None:
+    """It hears, does not answer, and an earlier program has armed it: each other servo gets an ACTION of its own."""
+    bench = bench_of(family)
+    arm(bench.devices[3])
+    bench.is_unanswered = lambda packet: packet.id == 3
+    bench.enable("a", "b")
+    assert bench.move(GOALS, together=together, confirm=True) == ACKED
+    assert not broadcasts(bench)
+    before = [device.joint.position for device in bench.devices.values()]
+    assert travel(bench, bench.devices[3]) == 0
+    for device in bench.devices.values():
+        device.joint.advance(bench.now)
+    assert [device.joint.position != start for device, start in zip(bench.devices.values(), before, strict=True)] == [
+        True,
+        True,
+        False,
+    ]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_action_of_its_own_that_is_not_acknowledged_is_an_error_of_that_servo(family: str) -> None:
+    bench = bench_of(family)
+    bench.enable("a", "b")
+    bench.is_unanswered = lambda packet: packet.id == 1 and packet.code == Instruction.ACTION
+    results = bench.move(GOALS, confirm=True)
+    assert isinstance(results["a"], ServobusError)
+    assert results["b"] is Outcome.ACKED
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_flag_is_read_again_after_a_doubtful_spell(family: str) -> None:
     bench = bench_of(family)
