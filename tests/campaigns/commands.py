@@ -39,9 +39,17 @@ class Shell:
         self.environ = {**os.environ, "XDG_RUNTIME_DIR": str(folder), **environ}
 
     async def start(self, *arguments: str) -> asyncio.subprocess.Process:
-        command = [sys.executable, "-m", "servobus", *arguments]
+        return await self._start("-m", "servobus", *arguments)
+
+    async def python(self, text: str) -> asyncio.subprocess.Process:
+        """Run a program of these lines."""
+        return await self._start("-c", text)
+
+    async def _start(self, *arguments: str) -> asyncio.subprocess.Process:
         pipe = asyncio.subprocess.PIPE
-        return await asyncio.create_subprocess_exec(*command, cwd=self.folder, env=self.environ, stdout=pipe, stderr=pipe)
+        return await asyncio.create_subprocess_exec(
+            sys.executable, *arguments, cwd=self.folder, env=self.environ, stdin=pipe, stdout=pipe, stderr=pipe
+        )
 
     async def run(self, *arguments: str) -> Ended:
         return await end_of(await self.start(*arguments))

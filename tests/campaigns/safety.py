@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from servobus.errors import ServobusError
-from tests.campaigns import commands, scenarios_goals, scenarios_mixed, scenarios_stops, scenarios_troubles
+from tests.campaigns import commands, daemons, scenarios_goals, scenarios_mixed, scenarios_stops, scenarios_troubles
 from tests.campaigns.bench import Case, Figures
 from tests.virtual_time import VirtualLoop
 
@@ -34,7 +34,7 @@ class Rule:
 
 ROWS = (*scenarios_goals.RULES, *scenarios_stops.RULES, *scenarios_troubles.RULES, *scenarios_mixed.RULES)
 RULES = [Rule(name, scenario, cases, runs) for name, scenario, cases, runs in ROWS]
-COMMANDS = [Rule(name, scenario, cases, runs, real=True) for name, scenario, cases, runs in commands.RULES]
+COMMANDS = [Rule(name, scenario, cases, runs, real=True) for name, scenario, cases, runs in (*commands.RULES, *daemons.RULES)]
 
 
 def run(rule: Rule, case: Case, runs: int, seed: int = 1) -> Figures:
