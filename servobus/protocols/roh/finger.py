@@ -17,9 +17,11 @@ from servobus.values import Loss, ServoGoal, Update, is_number
 
 BY_UNIT = {"%": ("pos_target", "pos"), "deg": ("angle_target", "angle")}
 """Unit of a finger -> registers of its target and of its position."""
-ROUNDING = {"%": 0, "deg": FULL}
-"""Steps by which a target may read back differently from what was written. The hand turns angles into positions, and replaces an
-angle outside its own range by its limit: an angle shows no restart."""
+PERCENT = FULL // 100
+"""Steps by which a register may read back differently from what was written: whether a hand rounds is not documented."""
+ROUNDING = {"%": PERCENT, "deg": FULL}
+"""The same of a target. The hand turns angles into positions, and replaces an angle outside its own range by its limit: an angle
+shows no restart."""
 MIN_STEP = 0.1
 """A finger arrives within about ten of these (% or degrees), however fine its registers are."""
 MAX_SPEED = FULL - 1
@@ -60,7 +62,7 @@ class HeldRegisters:
         """Return whether this reading is what the register held."""
         if name == self._target_name:
             return not self.targets or any(abs(raw - target) <= self._rounding for target in self.targets)
-        return self.settings.get(name, raw) == raw
+        return abs(self.settings.get(name, raw) - raw) <= PERCENT
 
 
 class Finger:

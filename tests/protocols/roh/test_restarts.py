@@ -133,6 +133,16 @@ def test_a_hand_that_does_not_answer_or_refuses_shows_nothing() -> None:
     assert verify(bench, "index") == {"index": Loss.RESTARTED}, "it initialises"
 
 
+def test_a_hand_that_rounds_what_is_written_shows_no_restart() -> None:
+    """Whether it does is not documented."""
+    bench = Bench().enable("index")
+    bench.move(goal("index", 50, speed=50))
+    bench.hand.poke("speed", 1, 32700)
+    bench.hand.fingers[1].target = 32700
+    assert verify(bench, "index") == {}
+    assert bench.run(bench.driver.fence(2, [], ["index"]))
+
+
 def test_a_speed_of_a_user_is_no_restart() -> None:
     bench = Bench().enable("index")
     bench.write("index", "speed", 65535, raw=True)
