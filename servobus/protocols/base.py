@@ -370,7 +370,7 @@ class Motion(ABC):
 
     @abstractmethod
     def preview_stop(self, targets: Sequence[StopTarget]) -> Sequence[Request[Any]]:
-        """Return the frames that a stop sends before it waits for a reply; where each needs a reply, one for each node.
+        """Return the frames of a stop that goes well, up to the last one that stops a servo: the questions too.
 
         Changes no state, and asks nothing.
         """

@@ -21,7 +21,7 @@ RESPONDER = r"""
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { PING = 1, READ = 2, WRITE = 3, REG_WRITE = 4, ACTION = 5, SYNC_WRITE = 0x83, EVERYBODY = 0xFE };
+enum { PING = 1, READ = 2, WRITE = 3, REG_WRITE = 4, ACTION = 5, SYNC_READ = 0x82, SYNC_WRITE = 0x83, EVERYBODY = 0xFE };
 static const unsigned char image[256] = {IMAGE};
 static unsigned char memory[256][256], pending[256][256], in[65536], out[65536];
 static unsigned pending_size[256];
@@ -67,6 +67,10 @@ int main(int argc, char **argv) {
             case ACTION:
                 for (unsigned i = 0; i < 256; i++)
                     if (pending_size[i]) { store(i, pending[i][0], pending[i] + 1, pending_size[i] - 1); pending_size[i] = 0; }
+                break;
+            case SYNC_READ:
+                for (unsigned i = 2; i < count; i++)
+                    answered = reply(answered, params[i], memory[params[i]] + params[0], params[1]);
                 break;
             case SYNC_WRITE:
                 step = params[1] + 1;

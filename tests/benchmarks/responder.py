@@ -12,14 +12,32 @@ import struct
 import sys
 from collections.abc import Iterator
 
-IMAGE = {0: 3, 1: 10, 3: 9, 4: 3, 7: 250, 8: 1, 11: 255, 12: 15, 13: 70, 15: 40, 16: 232, 17: 3, 19: 44, 20: 47, 26: 1, 27: 1}
+IMAGE = {
+    0: 3,
+    1: 10,
+    3: 9,
+    4: 3,
+    7: 250,
+    8: 1,
+    11: 255,
+    12: 15,
+    13: 70,
+    15: 40,
+    16: 232,
+    17: 3,
+    18: 12,
+    19: 44,
+    20: 47,
+    26: 1,
+    27: 1,
+}
 IMAGE |= {28: 255, 29: 1, 30: 1, 34: 20, 35: 200, 36: 80, 38: 200, 48: 232, 49: 3, 55: 1, 57: 8, 62: 120, 63: 25}
 """The bytes that are not 0 in the memory of an STS3215 at rest in the middle of its range; address 5 holds the id."""
 
 COUNTERS = struct.Struct("=QQ")
 """SYNC WRITE frames that arrived, and the servos in them."""
 
-PING, READ, WRITE, REG_WRITE, ACTION, SYNC_WRITE, EVERYBODY = 1, 2, 3, 4, 5, 0x83, 0xFE
+PING, READ, WRITE, REG_WRITE, ACTION, SYNC_READ, SYNC_WRITE, EVERYBODY = 1, 2, 3, 4, 5, 0x82, 0x83, 0xFE
 
 
 def image_in_c() -> str:
@@ -53,7 +71,9 @@ class Responder:
 
     def _answer(self, servo_id: int, instruction: int, params: bytes) -> bytes:
         if instruction == READ:
-            return reply(servo_id, bytes(self.memory[servo_id][params[0] : params[0] + params[1]]))
+            return self._read(servo_id, *params)
+        if instruction == SYNC_READ:
+            return b"".join(self._read(each, *params[:2]) for each in params[2:])
         if instruction == WRITE:
             self._store(servo_id, params)
         elif instruction == REG_WRITE:
@@ -66,6 +86,9 @@ class Responder:
             self._sync_write(params)
         answered = instruction in (PING, WRITE, REG_WRITE) and servo_id != EVERYBODY
         return reply(servo_id) if answered else b""
+
+    def _read(self, servo_id: int, address: int, size: int) -> bytes:
+        return reply(servo_id, bytes(self.memory[servo_id][address : address + size]))
 
     def _store(self, servo_id: int, params: bytes) -> None:
         self.memory[servo_id][params[0] : params[0] + len(params) - 1] = params[1:]

@@ -7,8 +7,8 @@ of the plan or was read as not armed. A node enters this table
 2. when its flag was read as 1: a REG WRITE of another program waits in it;
 3. before our own REG WRITE leaves, so that a plan may be closed at any frame; also after the ACTION, which has no reply.
 
-A configured node that never answered is not in the table: it may be absent, or receive all the same. While there is one, each member
-gets an ACTION of its own instead, so that a dead servo holds nobody up and nothing of it can be fired.
+A configured node that never answered is not in the table: it may be absent, or receive all the same. While there is one, each
+member gets an ACTION of its own instead, so that a dead servo holds nobody up and nothing of it can be fired.
 
 Only what we armed ourselves is disarmed without being asked: a harmless REG WRITE replaces the goal, an ACTION to this node alone
 fires it, and the flag is read back. What another program armed, `enable` and `disable` of that servo disarm.
