@@ -206,7 +206,7 @@ class Motion:
         plan = self._parts.driver.disable(servo)
         report = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True, patience=OTHERS_PATIENCE)
         if not report.confirmed:
-            message = f"torque off was written and not confirmed: {report.detail}"
+            message = f"it is not confirmed that it is disabled: {report.detail}"
             raise DeviceError(message, bus=self._parts.name, servo=servo)
         record.disable()
         record.torque_is(on=False)

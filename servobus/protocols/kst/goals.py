@@ -30,7 +30,8 @@ from servobus.values import Outcome, ServoGoal, StopReport, StopTarget
 
 HOLDS = "KST has no torque command: the servo keeps holding"
 OFFLINE = "offline: nothing was sent; it goes no farther than its last setpoint"
-NOT_ENABLED = "it was not enabled: servobus does not move it"
+NOT_ENABLED = "it was not enabled, and rests: nothing was sent"
+UNHEARD = "it was not enabled, and could not be read: whether it rests is not known"
 MAX_WAITS = 50
 """Setpoints in a row that a servo may let pass without coming nearer to the goal that it holds."""
 
@@ -143,13 +144,29 @@ def enable(settings: RequestSettings, servo: CalibratedServo) -> Plan[float]:
 
 
 def stop(settings: RequestSettings, targets: Sequence[tuple[CalibratedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
-    """Hold the enabled servos, also those that are to be limp; see above."""
+    """Hold the servos, also those that are to be limp; see above. One that was not enabled is held where it moves."""
+    reports = yield from _hold_all(settings, [(servo, target) for servo, target in targets if target.enabled])
+    others = {servo: target for servo, target in targets if not target.enabled}
+    reports |= {servo.name: StopReport("none", False, False, UNHEARD) for servo in others}
+    moving: list[tuple[CalibratedServo, StopTarget]] = []
+    for servo, readings in (yield from rest(settings, [servo for servo in others if others[servo].reachable])).items():
+        if rests(readings):
+            reports[servo.name] = StopReport("none", False, True, NOT_ENABLED)
+        elif not isinstance(readings, ServobusError):
+            moving.append((servo, others[servo]))
+    reports |= yield from _hold_all(settings, moving)
+    for servo, target in targets:
+        if target.kind == "limp":
+            servo.travel.end()
+    return {servo.name: _with_note(reports[servo.name], target) for servo, target in targets}
+
+
+def _hold_all(settings: RequestSettings, targets: Sequence[tuple[CalibratedServo, StopTarget]]) -> Plan[dict[str, StopReport]]:
+    """Hold servos, and read whether they rest then."""
     reports: dict[str, StopReport] = {}
     held: list[CalibratedServo] = []
     for servo, target in targets:
-        if not target.enabled:
-            reports[servo.name] = StopReport("none", False, True, NOT_ENABLED)
-        elif not target.reachable:
+        if not target.reachable:
             reports[servo.name] = StopReport("hold", False, False, OFFLINE)
         else:
             try:
@@ -159,10 +176,7 @@ def stop(settings: RequestSettings, targets: Sequence[tuple[CalibratedServo, Sto
                 reports[servo.name] = StopReport("hold", False, False, error.message)
     for servo, readings in (yield from rest(settings, held)).items():
         reports[servo.name] = _report(servo, readings)
-    for servo, target in targets:
-        if target.kind == "limp":
-            servo.travel.end()
-    return {servo.name: _with_note(reports[servo.name], target) for servo, target in targets}
+    return reports
 
 
 def _hold(settings: RequestSettings, servo: CalibratedServo, target: StopTarget) -> Plan[None]:
@@ -189,6 +203,6 @@ def _with_note(report: StopReport, target: StopTarget) -> StopReport:
 
 
 def disable(settings: RequestSettings, servo: CalibratedServo) -> Plan[StopReport]:
-    """Hold the servo. One that was not enabled is sent nothing."""
+    """Hold the servo. One that was not enabled, and rests, is sent nothing."""
     target = StopTarget(servo.name, "limp", enabled=servo.travel.range is not None)
     return (yield from stop(settings, [(servo, target)]))[servo.name]

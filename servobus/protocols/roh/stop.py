@@ -27,7 +27,8 @@ from servobus.values import StopReport, StopTarget
 REPEATS = 2
 """How often an unanswered write is sent, because a bad line may lose one."""
 HOLDS = "a ROH hand has no torque command: the finger keeps holding"
-NOT_ENABLED = "it was not enabled: servobus does not move it"
+NOT_ENABLED = "it was not enabled, and rests: nothing was written"
+UNHEARD = "it was not enabled, and could not be read: whether it rests is not known"
 
 Targets = dict[Finger, StopTarget]
 Written = dict[Finger, int]
@@ -37,9 +38,35 @@ OFFLINE = ReplyTimeout("offline: nothing was confirmed")
 
 
 def stop(hands: Mapping[int, Hand], targets: Sequence[tuple[Finger, StopTarget]]) -> Plan[dict[str, StopReport]]:
-    """Return the plan of a stop; see above."""
-    reports = {finger.name: StopReport("none", False, True, NOT_ENABLED) for finger, target in targets if not target.enabled}
-    enabled = {finger: target for finger, target in targets if target.enabled}
+    """Return the plan of a stop; see above. A finger that was not enabled is held where it moves."""
+    reports = yield from _hold_all(hands, {finger: target for finger, target in targets if target.enabled})
+    others = {finger: target for finger, target in targets if not target.enabled}
+    reports |= {finger.name: StopReport("none", False, False, UNHEARD) for finger in others}
+    moving: Targets = {}
+    for unit, hand in hands.items():
+        asked = [finger for finger, target in others.items() if finger.node == unit and target.reachable]
+        resting = yield from _resting(hand, asked)
+        reports |= {finger.name: StopReport("none", False, True, NOT_ENABLED) for finger, rested in resting.items() if rested}
+        moving |= {finger: others[finger] for finger, rested in resting.items() if not rested}
+    reports |= yield from _hold_all(hands, moving)
+    return {finger.name: _with_note(reports[finger.name], target) for finger, target in targets}
+
+
+def _resting(hand: Hand, fingers: Sequence[Finger]) -> Plan[dict[Finger, bool]]:
+    """Return whether each of these fingers rests; nothing for a hand that cannot be read."""
+    if not fingers:
+        return {}
+    try:
+        yield from hand.attach()
+        readings = yield from rest(hand, fingers)
+    except ServobusError:
+        return {}
+    return {finger: rests(finger, *readings[finger]) for finger in fingers}
+
+
+def _hold_all(hands: Mapping[int, Hand], enabled: Targets) -> Plan[dict[str, StopReport]]:
+    """Hold fingers, and read whether they rest then."""
+    reports: dict[str, StopReport] = {}
     written: Written = {}
     failed: Failures = {finger: OFFLINE for finger, target in enabled.items() if not target.reachable}
     for unit, hand in hands.items():
@@ -54,12 +81,13 @@ def stop(hands: Mapping[int, Hand], targets: Sequence[tuple[Finger, StopTarget]]
     for unit, hand in hands.items():
         held = [finger for finger in written if finger.node == unit and finger not in failed]
         reports |= yield from _confirm(hand, held, written)
-    reports |= {finger.name: StopReport("hold", finger in written, False, error.message) for finger, error in failed.items()}
-    return {finger.name: _with_note(reports[finger.name], target) for finger, target in targets}
+    return reports | {
+        finger.name: StopReport("hold", finger in written, False, error.message) for finger, error in failed.items()
+    }
 
 
 def disable(hand: Hand, finger: Finger) -> Plan[StopReport]:
-    """Hold the finger. One that was not enabled is sent nothing."""
+    """Hold the finger. One that was not enabled, and rests, is written nothing."""
     target = StopTarget(finger.name, "limp", enabled=finger.is_begun)
     reports = yield from stop({hand.unit: hand}, [(finger, target)])
     finger.held.targets.clear()

@@ -10,7 +10,7 @@ from servobus.errors import DeviceError, LimitError, NotSupported, ReplyTimeout,
 from servobus.protocols.base import Driver, run_plan
 from servobus.protocols.kst.codec import Command, encode
 from servobus.protocols.kst.driver import KstDriver
-from servobus.values import Goal, ServoGoal
+from servobus.values import Goal, ServoGoal, StopTarget
 from tests.protocols.kst.bench import Bench, changed_model, goal
 
 
@@ -235,3 +235,24 @@ def test_driver_is_made_from_options_and_models() -> None:
     bench = Bench({})
     assert isinstance(bench.driver, KstDriver)
     assert bench.driver.nodes == {}
+
+
+# Stops of servos that were not enabled
+
+
+def test_what_another_program_moves_is_stopped_too() -> None:
+    """A servo that was not enabled may be on its way all the same: from a program that was killed, say."""
+    bench = Bench(model=changed_model(max_steps_per_second=200.0))
+    bench.devices[0].goal = 800.0
+    reports = bench.after(1).run(bench.driver.stop([StopTarget("pan", "hold", enabled=False)]))
+    assert (reports["pan"].action, reports["pan"].written, reports["pan"].confirmed) == ("hold", True, True)
+    stopped = bench.devices[0].goal
+    assert bench.after(3).devices[0].position == stopped < 300
+
+
+def test_what_is_not_known_to_rest_is_not_confirmed() -> None:
+    bench = Bench()
+    bench.devices[0].dead = True
+    stops = [StopTarget("pan", "hold", enabled=False), StopTarget("tilt", "hold", enabled=False, reachable=False)]
+    reports = bench.run(bench.driver.stop(stops))
+    assert [(each.written, each.confirmed) for each in reports.values()] == [(False, False)] * 2

@@ -38,7 +38,22 @@ def test_what_was_not_enabled_is_left_alone() -> None:
     reports = bench.run(bench.driver.stop([target("index", position=0.0), target("ring", enabled=False)]))
     assert reports["ring"].action == "none"
     read = "unit 2 READ 1136 to 1146"
-    assert bench.frames() == [read, "unit 2 WRITE 1136 = 0", read, read]
+    assert bench.frames() == [read, "unit 2 WRITE 1136 = 0", read, read, *["unit 2 READ 1138 to 1148"] * 2]
+
+
+def test_what_another_program_moves_is_stopped_too() -> None:
+    """A finger that was not enabled may be on its way all the same: from a program that was killed, say."""
+    bench = Bench().enable("index")
+    bench.move(goal("index", 100, speed=20))
+    reports = bench.after(1).run(bench.driver.stop([target("index", enabled=False)]))
+    assert (reports["index"].action, reports["index"].written, reports["index"].confirmed) == ("hold", True, True)
+    assert bench.after(5).hand.fingers[1].position < 0.3 * 65535
+
+
+def test_what_is_not_known_to_rest_is_not_confirmed() -> None:
+    bench = Bench().enable("index")
+    report = bench.run(bench.driver.stop([target("index", enabled=False, reachable=False)]))["index"]
+    assert (report.action, report.written, report.confirmed) == ("none", False, False)
 
 
 def test_where_limp_was_wanted_it_holds_and_says_so() -> None:
@@ -140,4 +155,4 @@ def test_disable_holds_a_finger_that_moves() -> None:
     assert bench.after(5).hand.fingers[1].position == pytest.approx(0.2 * 65535, rel=0.05)
     bench.frames()
     assert bench.run(bench.driver.disable("index")).action == "none"
-    assert bench.frames() == []
+    assert bench.frames() == ["unit 2 READ 1136 to 1146"] * 2
