@@ -16,7 +16,8 @@
 2. In rounds: each servo that is not confirmed yet is read (mode, torque, goal, position in one turn; one SYNC READ for those that
    know it), and what its rule asks for is written straight after. A round reads anew, so no old position is written again.
    A servo that does not answer gets the estimate once; it delays the others by its own turn alone.
-3. What we armed with REG WRITE is disarmed.
+3. Effort and acceleration of the last goal are put back, so that neither outlives this process; what we armed with REG WRITE is
+   disarmed.
 
 One reading is not believed where it surprises: a position that does not agree with the estimate, another mode than identified,
 torque 0 where it was on. It is read again before anything follows from it.
@@ -60,6 +61,12 @@ class Stopper:
         for number in range(ROUNDS):
             for group in self._groups([stop for stop in stops if stop.pending]):
                 yield from self._round(group, number)
+        for stop in stops:
+            servo = stop.servo
+            if stop.report.confirmed and stop.target.enabled:
+                own = {name: raw for name, raw in servo.own.items() if getattr(servo.options, name) is None}
+                with suppress(ServobusError):
+                    yield from self._put_back(servo, own)
         yield from self._armed.disarm_ours([stop.servo.node for stop in stops if stop.target.reachable and not stop.silences])
         return {stop.servo.name: stop.report for stop in stops}
 
@@ -83,13 +90,17 @@ class Stopper:
         if (yield from ask(servo.read_raw(torque))):
             return StopReport("limp", True, False, "torque still reads on")
         with suppress(ServobusError):
-            for name, raw in servo.own.items():
-                if servo.held.get(name) != raw:
-                    yield from ask(self._write(servo, servo.model.registers[name], raw))
-                    servo.hold({name: raw})
+            yield from self._put_back(servo, servo.own)
             if servo.node in self._armed and (yield from self._armed.flag(servo.node)):
                 yield from self._armed.disarm(servo)
         return StopReport("limp", True, True)
+
+    def _put_back(self, servo: HostServo, own: Mapping[str, int]) -> Plan[None]:
+        """Write these settings of the servo's own where a goal has changed them."""
+        for name, raw in own.items():
+            if servo.held.get(name) != raw:
+                yield from ask(self._write(servo, servo.model.registers[name], raw))
+                servo.hold({name: raw})
 
     # Rounds
 

@@ -8,7 +8,7 @@ import pytest
 
 from servobus.errors import DeviceError, LimitError, NotSupported, ServobusError
 from servobus.protocols.sms.codec import Instruction, Packet
-from servobus.values import Goal, ServoGoal
+from servobus.values import Goal, ServoGoal, StopTarget
 from tests.protocols.sms.bench import Bench
 from tests.protocols.sms.states import FAMILIES, moving, put, set_mode, travel
 
@@ -199,6 +199,26 @@ def test_the_effort_of_one_goal_does_not_outlive_it(family: str, mode: str, own:
     bench.sent.clear()
     bench.move({"a": goals[0]})
     assert len(bench.sent[0].params) == (7 if mode == "position" else 3), "once is enough"
+
+
+@pytest.mark.parametrize("configured", [None, 50])
+@pytest.mark.parametrize("kind", ["hold", "limp"])
+@pytest.mark.parametrize("family", ["sts", "sms"])
+def test_the_effort_of_one_goal_does_not_outlive_its_process(family: str, kind: str, configured: float | None) -> None:
+    """An exit that holds ends with a stop; the next process takes what it finds for the servo's own."""
+    bench = Bench({"a": {"id": 1, "model": family} | ({"torque_limit": configured} if configured else {})})
+    put(bench.devices[1], "torque_limit", 700)
+    bench.enable()
+    bench.move({"a": Goal("position", 5, effort=30)})
+    report = bench.run(bench.driver.stop([StopTarget("a", kind, enabled=True)]))["a"]  # type: ignore[arg-type]
+    assert report.confirmed
+    if configured is None:
+        assert bench.register(1, "torque_limit") == 700
+    next_process = Bench({"a": bench.options.servos["a"].model_dump(exclude_unset=True)})
+    next_process.devices = bench.devices
+    next_process.enable()
+    next_process.move({"a": 6})
+    assert bench.register(1, "torque_limit") == (700 if configured is None else 500)
 
 
 @pytest.mark.parametrize("family", ["sts", "sms", "sms_cl"])
