@@ -37,9 +37,11 @@ class Case:
     mode: str = "position"
     polls: str = "polls"
     gateway: bool = False
+    keys: str = ""
+    """More keys of the bus."""
 
     def __str__(self) -> str:
-        parts = (self.protocol, self.model, self.mode, self.polls, "behind an arm" if self.gateway else "")
+        parts = (self.protocol, self.model, self.mode, self.polls, "behind an arm" if self.gateway else "", self.keys)
         return " ".join(part for part in parts if part)
 
 
@@ -168,5 +170,6 @@ async def moved(rig: LocalRig, name: str, position: float, speed: float) -> Serv
 MODES = [Case("sms", model, mode) for model, family in FAMILIES.items() for mode in family.modes]
 SMS = [case for case in MODES if case.mode == "position"]
 KST, ROH, ARM = Case("kst"), Case("roh"), Case("roh", gateway=True)
-ALL = [*SMS, KST, ROH, ARM]
+FULL_DUPLEX = Case("kst", keys="duplex: full")
+ALL = [*SMS, KST, FULL_DUPLEX, ROH, ARM]
 WITHOUT_POLLS = [replace(case, polls=polls) for case in ALL for polls in POLLS]

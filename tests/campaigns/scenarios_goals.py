@@ -6,7 +6,22 @@ import asyncio
 import random
 
 from servobus.errors import NotEnabled, ServobusError
-from tests.campaigns.bench import ALL, AWAY, HOME, KST, MODES, SMS, SPEED, WITHOUT_POLLS, Bench, Case, Figures, moved, tried
+from tests.campaigns.bench import (
+    ALL,
+    AWAY,
+    FULL_DUPLEX,
+    HOME,
+    KST,
+    MODES,
+    SMS,
+    SPEED,
+    WITHOUT_POLLS,
+    Bench,
+    Case,
+    Figures,
+    moved,
+    tried,
+)
 from tests.campaigns.witness import WitnessServo
 from tests.campaigns.witness_kst import KstServo
 from tests.campaigns.witness_sms import END, MAJOR, MAX_LIMIT, MIN_LIMIT, MINOR, PHASE, TORQUE_LIMIT, SmsServo
@@ -256,7 +271,7 @@ RULES = [
     ("3 a stranger", stranger, SMS, 80),
     ("4 restart of 0 to 2 s", restart, WITHOUT_POLLS, 1000),
     ("5 effort does not outlive its goal", effort, [case for case in SMS if case.model in ("sts", "sms")], 20),
-    ("c led servo that did not hear", lead_setpoints, [KST], 200),
+    ("c led servo that did not hear", lead_setpoints, [KST, FULL_DUPLEX], 200),
     ("d torque that is gone", torque_lost, SMS, 200),
     ("e one reading believed", one_reading, SMS, 200),
     ("h a motion cut short", cut_motion, ALL, 140),
