@@ -15,12 +15,14 @@ from typing import Any
 from servobus.errors import ServobusError
 from servobus.rig.local import LocalRig
 from servobus.values import StopReport
-from tests.campaigns.bench import ALL, AWAY, HOME, MODES, SPEED, Bench, Case, Figures, moved, tried
+from tests.campaigns.bench import ALL, AWAY, HOME, MODES, SMS, SPEED, Bench, Case, Figures, moved, tried
 from tests.campaigns.scenarios_stops import EFFECT
 from tests.campaigns.witness import NEVER, WitnessServo
-from tests.campaigns.witness_sms import SmsServo
+from tests.campaigns.witness_sms import SmsServo, status
 
 STEPS = 60
+ALTERED = 0.01
+"""Share of replies whose data is altered in a way that the sum does not show."""
 NAMES = ("s1", "s2", "s3")
 
 
@@ -174,12 +176,30 @@ STEPS_OF: dict[str, list[Step]] = {
 
 async def mixed(case: Case, rng: random.Random, figures: Figures) -> None:
     """Verbs and troubles in any order."""
+    await _run(Bench(case, rng, 3), figures)
+
+
+async def altered(case: Case, rng: random.Random, figures: Figures) -> None:
+    """The same, and one reply in a hundred has another bit somewhere in its data, with the right sum."""
     bench = Bench(case, rng, 3)
-    policies = rng.choice([("",), ("", ", on_estop: limp"), (", on_lost_client: limp",)]) if case.protocol == "sms" else ("",)
-    async with bench.rig(*policies) as rig:
+    bench.line.alter = lambda node, reply: _altered(reply, rng)
+    await _run(bench, figures)
+
+
+def _altered(reply: bytes, rng: random.Random) -> bytes:
+    data = bytearray(reply[5:-1])
+    if not data or rng.random() > ALTERED:
+        return reply
+    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return status(reply[2], reply[4], bytes(data))
+
+
+async def _run(bench: Bench, figures: Figures) -> None:
+    policies = [("",), ("", ", on_estop: limp"), (", on_lost_client: limp",)] if bench.case.protocol == "sms" else [("",)]
+    async with bench.rig(*bench.rng.choice(policies)) as rig:
         run = Mixed(bench, rig, figures)
         await run.run()
-    if case.protocol == "sms":
+    if bench.case.protocol == "sms":
         for name, asked in run.asked.items():
             outside = [at for at in run.servo(name).energised_at if not any(begin <= at <= end for begin, end in asked.enables)]
             figures.energised += len(outside)
@@ -187,4 +207,7 @@ async def mixed(case: Case, rng: random.Random, figures: Figures) -> None:
 
 VELOCITY = [case for case in MODES if case.mode == "velocity"]
 CASES = [replace(case, polls=polls) for case in (*ALL, *VELOCITY) for polls in ("polls", "no polls")]
-RULES = [("all: verbs and troubles in any order", mixed, CASES, 1000)]
+RULES = [
+    ("all: verbs and troubles in any order", mixed, CASES, 1000),
+    ("e any reply altered, in any order", altered, [*SMS, *VELOCITY], 280),
+]
