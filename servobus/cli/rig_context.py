@@ -19,7 +19,7 @@ from servobus.remote.rig import RemoteRig, connect
 from servobus.rpc.socket_path import VARIABLE, find_socket
 from servobus.values import Health, State, StopReport
 
-KEPT = "the daemon keeps it; `servobus disable` switches its torque off"
+KEPT = "the daemon keeps it enabled; `servobus disable` disables it"
 GONE = "the connection to the daemon is lost: if it has died, nobody stops the servo; `servobus disable --direct` does"
 OTHERS = (
     "the daemon at {address} has no bus of {config}: which of the two is meant? Leave the config out (-c, SERVOBUS_CONFIG), or "

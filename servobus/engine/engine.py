@@ -300,10 +300,10 @@ class Engine:
             self.stats.counts[Counter.STRAYS] += 1
             node = self.nodes.node(reply.node)
             node.late(reply.key, now)
-            node.causes[Cause.LATE] += 1
+            node.causes[Cause.LATE] += turn is None or turn.cause_of(reply) is not Cause.NO_ANSWER
             asked = turn is not None and reply.node in turn.request.nodes
             if turn is not None:
-                self._foreign = turn, Cause.LATE if asked else Cause.FOREIGN
+                self._foreign = turn, turn.cause_of(reply)
             if node.configured or asked:
                 self.nodes.doubt(node, reply.key, node.outstanding.get(reply.key, now))
 

@@ -29,6 +29,7 @@ TIMEOUTS = {
     Cause.SILENT: ("no answer", "is it powered, are id and baud rate right?"),
     Cause.GARBLED: ("garbled replies", "are there two servos with this id, another baud rate, or noise on the line?"),
     Cause.FOREIGN: ("only replies of other nodes", "does a second program or master use the line?"),
+    Cause.NO_ANSWER: ("the gateway reports no answer", "is it powered, are id and baud rate right?"),
     Cause.LATE: ("only a late reply", "it is slower than expected: set timeout_ms of the bus"),
 }
 """Cause -> what happened, and the next step."""

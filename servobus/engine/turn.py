@@ -18,6 +18,7 @@ from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from servobus.engine.job import Job
+from servobus.engine.stats import Cause
 from servobus.protocols.base import Codec, Reply, Request
 
 
@@ -74,6 +75,12 @@ class Turn(Transmit):
         """Return the nodes whose reply has not come."""
         replied = {reply.node for reply in self.replies}
         return [node for node in self.request.nodes if node not in replied]
+
+    def cause_of(self, stray: Reply) -> Cause:
+        """Return why this turn has no value, where this came instead of a reply."""
+        if stray.node not in self.request.nodes:
+            return Cause.FOREIGN
+        return Cause.NO_ANSWER if self.request.relayed and self.request.is_silence((stray,)) else Cause.LATE
 
 
 class Window(Enum):

@@ -11,7 +11,7 @@ from servobus.engine.stats import Cause
 from servobus.errors import DeviceError, ReplyTimeout
 from servobus.values import Health
 from tests.engine.driven_engine import Rig
-from tests.engine.toy_protocol import ANSWER, PING, READ, REFUSED, ToyRequest, poll, read, reply, write
+from tests.engine.toy_protocol import ANSWER, PING, READ, REFUSED, ToyReply, ToyRequest, poll, read, reply, write
 
 ARRIVALS = {
     Cause.SILENT: [],
@@ -66,6 +66,21 @@ def test_a_gateway_that_has_no_answer_counts_as_silence() -> None:
     assert rig.node(1).health is Health.DOUBTFUL
     assert rig.node(1).causes[Cause.NO_ANSWER] == 1
     assert rig.node(1).misses == 1, "it may be offline: it was not the node that answered"
+
+
+class Unanswered(Relayed):
+    """What the gateway says is no reply to it either."""
+
+    def answers(self, reply: ToyReply) -> bool:
+        return super().answers(reply) and not self.is_silence((reply,))
+
+
+def test_what_a_gateway_says_of_a_silent_node_is_no_late_reply_of_it() -> None:
+    rig = Rig()
+    results = rig.submit(Unanswered(1, READ, 5), tries=1)
+    rig.hear(reply(1, READ, 99).frame)
+    assert "the gateway reports no answer after 1 try" in str(results[0])
+    assert (rig.node(1).causes[Cause.NO_ANSWER], rig.node(1).causes[Cause.LATE]) == (1, 0)
 
 
 def test_refusals_are_counted_and_polls_that_are_refused_make_it_fail() -> None:
