@@ -95,7 +95,7 @@ class SmsDriver(Driver):
         return self._reader.polls(rates)
 
     def read_register(self, servo: str, register: str, *, raw: bool = False) -> Request[Any]:
-        made = self._reader.registers.get((servo, register, raw))
+        made = self.servos[servo].reads.get((register, raw))
         return self._reader.register(servo, register, raw=raw) if made is None else made
 
     def write_register(self, servo: str, register: str, value: Any, *, raw: bool = False, persist: bool = False) -> Plan[Any]:

@@ -41,10 +41,14 @@ class Version(NamedTuple):
         models = packaged_models().values()
         return next((model for model in models if model.family.covers(self.end, self.major, self.minor)), None)
 
+    @property
+    def number(self) -> int:
+        """The model number, in the servo's byte order."""
+        return self.major << 8 | self.minor if self.end else self.minor << 8 | self.major
+
     def identity(self) -> Identity:
         """Return what these bytes tell."""
-        model = self.model
-        number = self.major << 8 | self.minor if self.end else self.minor << 8 | self.major
+        model, number = self.model, self.number
         product = model.model_numbers.get(number) if model else None
         firmware = f"{self.firmware_major}.{self.firmware_minor}"
         return Identity(model=model.name if model else None, product=product or f"model number {number}", firmware=firmware)
@@ -112,13 +116,20 @@ def _fit(servo: HostServo, version: Version, registers: Mapping[str, int]) -> Fi
     low, high = (registers[name] for name in LIMITS)
     mode, scale = model.mode(registers), model.speed_scale(registers)
     obstacle = _mode_obstacle(model, mode, registers) or _value_obstacle(model, registers)
+    units = _units(model, version)
     if (low, high) == (0, 0):  # more than one turn
-        return Fit(mode, None, level, scale, obstacle, True)
+        return Fit(mode, None, level, scale, obstacle, True, units)
     if low >= high:
         obstacle = (
             obstacle or f"its stored limits are in the wrong order ({LIMITS[0]} {low}, {LIMITS[1]} {high}): write them anew"
         )
-    return Fit(mode, (low, high), level, scale, obstacle, True)
+    return Fit(mode, (low, high), level, scale, obstacle, True, units)
+
+
+def _units(model: SmsModel, version: Version) -> Mapping[str, float]:
+    """Return the units of a product whose steps have another size. A user's model file with units of its own counts more."""
+    packaged = version.model
+    return model.product_units.get(version.number, {}) if packaged and packaged.units == model.units else {}
 
 
 # Why it must not be moved

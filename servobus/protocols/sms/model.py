@@ -102,6 +102,8 @@ class SmsModel(ServoModel):
     is in a mode that this model does not know, and is not moved."""
     speed_unit: SpeedUnit | None = None
     """None: the scale of the registers holds for every servo."""
+    product_units: dict[int, dict[str, float]] = {}
+    """Model number -> units (as `units`) of a product whose steps have another size."""
     supported: dict[str, list[int]] = {}
     """Register -> the values with which everything else of this file is true. A servo with another one is not moved."""
     time_is_ms: bool = False

@@ -32,8 +32,6 @@ class Reader:
     def __init__(self, options: SmsBus, servos: Mapping[str, HostServo]) -> None:
         self.options = options
         self.servos = servos
-        self.registers: dict[tuple[str, str, bool], Request[Any]] = {}
-        """The reads that were made already, by servo, register and `raw`."""
         self._states = {name: _state_read(servo) for name, servo in servos.items()}
         self._guards = self._blocks({servo.name: (servo.guard_span, servo.decode_guards) for servo in servos.values()})
 
@@ -43,13 +41,13 @@ class Reader:
 
     def register(self, name: str, register: str, *, raw: bool) -> Request[Any]:
         """Return the read of a register, or of an ADDR:LEN. Raises UnknownName, NotSupported, LimitError."""
-        request = self.registers.get((name, register, raw))
+        servo = self.servos[name]
+        request = servo.reads.get((register, raw))
         if request is None:
-            servo = self.servos[name]
             span = parse_span(register, table_size=TABLE_SIZE, max_count=MAX_READ, servo=name)
             if span is not None:
                 return Read(servo.node, *span, list)
-            request = self.registers[name, register, raw] = self._register_read(servo, register, raw=raw)
+            request = servo.reads[register, raw] = self._register_read(servo, register, raw=raw)
         return request
 
     @staticmethod

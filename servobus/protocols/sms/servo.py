@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from struct import Struct
 from typing import Any
 
@@ -12,7 +13,7 @@ from servobus.protocols.model import Register
 from servobus.protocols.sms.model import LIMITS, SmsModel
 from servobus.protocols.sms.options import SmsServo
 from servobus.protocols.sms.requests import Read, RegisterRead
-from servobus.values import Loss, Update, is_number
+from servobus.values import Calibration, Loss, Update, is_number
 
 STRUCT_CODES = {1: "B", 2: "H", 4: "I"}
 """Bytes of a register -> its code for `struct`; signs are sign and magnitude, so every register is unsigned on the wire."""
@@ -44,6 +45,8 @@ class Fit:
     obstacle: str = ""
     """Why it must not be moved; empty: it may be moved."""
     identified: bool = False
+    units: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Units of a product whose steps have another size than its model says."""
 
     @property
     def takes(self) -> str | None:
@@ -70,6 +73,8 @@ class HostServo:
         replaced when one changes, never changed."""
         self._unconfirmed: Mapping[str, int] = {}
         """Settings that were sent once in a frame that has no reply."""
+        self.reads: dict[tuple[str, bool], Read[Any]] = {}
+        """Reads of registers that were made already, by name and `raw`; they follow from what it reported."""
         self.own: Mapping[str, int] = {}
         """Raw acceleration and torque limit that `enable` read: a goal that names none leaves the servo at them."""
         self.guard_span = self._guard_span()
@@ -87,8 +92,16 @@ class HostServo:
         """Keep what the servo reported. An equal fit is not replaced, so goals packed for it remain valid."""
         if fit != self.fit:
             self.fit, self.takes = fit, fit.takes
+            self.calibration = self._calibration()
+            self.reads.clear()
         if fit.response_level is not None:
             self.answers_writes = fit.response_level != 0
+
+    def _calibration(self) -> Calibration:
+        """Return the conversion between raw steps and its unit, for the product that it is."""
+        calibration = self.options.calibration(self.model)
+        size = self.fit.units.get(self.options.unit or next(iter(self.model.units)))
+        return calibration if size is None else replace(calibration, unit_per_step=size / self.options.gear)
 
     @property
     def limits(self) -> tuple[float, float] | None:
@@ -201,14 +214,14 @@ class HostServo:
 
     def converter(self, register: Register) -> Callable[[int], Any]:
         """Return the function from a raw value to the physical one, in the servo's unit where the register has such a unit."""
-        scale, calibration = register.scale, self.calibration
+        scale = register.scale
         match register.unit:
             case "position":
-                return lambda raw: calibration.to_unit(raw * scale)
+                return lambda raw: self.calibration.to_unit(raw * scale)
             case "speed":
-                return lambda raw: calibration.rate_to_unit(raw * (self.fit.speed_scale or scale))
+                return lambda raw: self.calibration.rate_to_unit(raw * (self.fit.speed_scale or scale))
             case "acceleration":
-                return lambda raw: raw * scale * calibration.unit_per_step
+                return lambda raw: raw * scale * self.calibration.unit_per_step
             case _:
                 return register.to_physical
 

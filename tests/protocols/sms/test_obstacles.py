@@ -217,3 +217,39 @@ def test_no_register_is_written_by_name_where_another_table_is(
     with pytest.raises(NotSupported, match="is not written: "):
         bench.run(plan)
     assert not bench.sent
+
+
+# Another product
+
+
+@pytest.mark.parametrize(("number", "degrees"), [((5, 15), 220), ((5, 4), 300)])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_product_moves_at_its_own_scale_and_not_at_that_of_its_family(
+    number: tuple[int, int], degrees: int, direction: int
+) -> None:
+    """1024 steps are 300 degrees of an SCS0009 (its data sheet; rustypot), and 220 of an SCS15."""
+    bench = Bench({"a": {"id": 1, "model": "scs", "direction": direction, "speed": 30}})
+    bench.devices[1].pose_as(1, *number)
+    before = bench.ask(bench.driver.read_register("a", "present_position"))
+    assert before == 0
+    bench.enable()
+    steps = round(direction * 45 * 1024 / degrees)
+    bench.move({"a": 45})
+    assert bench.register(1, "goal_position") == 512 + steps
+    assert bench.register(1, "goal_speed") == round(30 * 1024 / degrees)
+    bench.now += 10
+    state = bench.ask(bench.driver.read_state("a"))["a"]
+    assert state["position"] == pytest.approx(45, abs=0.3)
+    assert bench.ask(bench.driver.read_register("a", "present_position")) == pytest.approx(45, abs=0.3)
+    low, high = bench.driver.servos["a"].limits or (0, 0)
+    assert high - low == pytest.approx(degrees * 983 / 1024), "limits 20 to 1003"
+
+
+def test_units_of_a_model_file_of_the_user_count_more_than_those_of_the_product() -> None:
+    bench = Bench({"a": {"id": 1, "model": "scs"}})
+    servo = bench.driver.servos["a"]
+    servo.model = servo.model.model_copy(update={"units": {"deg": 0.5}})
+    bench.devices[1].pose_as(1, 5, 4)
+    bench.enable()
+    bench.move({"a": 45})
+    assert bench.register(1, "goal_position") == 512 + 90
