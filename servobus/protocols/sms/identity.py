@@ -116,7 +116,8 @@ def _fit(servo: HostServo, version: Version, registers: Mapping[str, int]) -> Fi
     low, high = (registers[name] for name in LIMITS)
     mode, scale = model.mode(registers), model.speed_scale(registers)
     obstacle = _mode_obstacle(model, mode, registers) or _value_obstacle(model, registers)
-    units = _units(model, version)
+    packaged = version.model  # a user's model file with units of its own counts more than a product's
+    units = model.product_units.get(version.number) if packaged and packaged.units == model.units else None
     if (low, high) == (0, 0):  # more than one turn
         return Fit(mode, None, level, scale, obstacle, True, units)
     if low >= high:
@@ -124,12 +125,6 @@ def _fit(servo: HostServo, version: Version, registers: Mapping[str, int]) -> Fi
             obstacle or f"its stored limits are in the wrong order ({LIMITS[0]} {low}, {LIMITS[1]} {high}): write them anew"
         )
     return Fit(mode, (low, high), level, scale, obstacle, True, units)
-
-
-def _units(model: SmsModel, version: Version) -> Mapping[str, float]:
-    """Return the units of a product whose steps have another size. A user's model file with units of its own counts more."""
-    packaged = version.model
-    return model.product_units.get(version.number, {}) if packaged and packaged.units == model.units else {}
 
 
 # Why it must not be moved

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from struct import Struct
@@ -45,7 +44,7 @@ class Fit:
     obstacle: str = ""
     """Why it must not be moved; empty: it may be moved."""
     identified: bool = False
-    units: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    units: Mapping[str, float] | None = None
     """Units of a product whose steps have another size than its model says."""
 
     @property
@@ -100,7 +99,7 @@ class HostServo:
     def _calibration(self) -> Calibration:
         """Return the conversion between raw steps and its unit, for the product that it is."""
         calibration = self.options.calibration(self.model)
-        size = self.fit.units.get(self.options.unit or next(iter(self.model.units)))
+        size = (self.fit.units or {}).get(self.options.unit or next(iter(self.model.units)))
         return calibration if size is None else replace(calibration, unit_per_step=size / self.options.gear)
 
     @property

@@ -61,12 +61,10 @@ class Stopper:
         for number in range(ROUNDS):
             for group in self._groups([stop for stop in stops if stop.pending]):
                 yield from self._round(group, number)
-        for stop in stops:
-            servo = stop.servo
-            if stop.report.confirmed and stop.target.enabled:
+        for servo in [stop.servo for stop in stops if stop.report.confirmed and stop.target.enabled]:
+            with suppress(ServobusError):
                 own = {name: raw for name, raw in servo.own.items() if getattr(servo.options, name) is None}
-                with suppress(ServobusError):
-                    yield from self._put_back(servo, own)
+                yield from self._put_back(servo, own)
         yield from self._armed.disarm_ours([stop.servo.node for stop in stops if stop.target.reachable and not stop.silences])
         return {stop.servo.name: stop.report for stop in stops}
 
