@@ -16,9 +16,11 @@ from servobus.values import Outcome
 from tests.campaigns.witness import WitnessLine, WitnessServo, witnessed
 from tests.campaigns.witness_kst import KstLine, KstServo
 from tests.campaigns.witness_roh import RohHand, RohLine
-from tests.campaigns.witness_sms import FAMILIES, SmsLine, SmsServo
+from tests.campaigns.witness_sms import FAMILIES, RESPONSE_LEVEL, SmsLine, SmsServo
 
 POLLS = {"polls": "{feedback: 50, health: 2}", "slow polls": "{health: 1}", "no polls": ""}
+READ_ONLY = "status_return: read_only"
+"""The servos acknowledge no writes."""
 HOME, AWAY, SPEED = "home", "away", "speed"
 UNITS = {
     "sms": {HOME: 0.0, AWAY: 30.0, SPEED: 60.0},
@@ -139,7 +141,9 @@ class Bench:
 
 def _servo(case: Case, number: int) -> WitnessServo:
     if case.protocol == "sms":
-        return SmsServo(number, case.model, mode=case.mode)
+        servo = SmsServo(number, case.model, mode=case.mode)
+        servo.memory[RESPONSE_LEVEL] = case.keys != READ_ONLY
+        return servo
     if case.protocol == "kst":
         return KstServo(0x20 + number, position=300.0)
     return RohHand(1 + number)
@@ -168,7 +172,7 @@ async def moved(rig: LocalRig, name: str, position: float, speed: float) -> Serv
 
 
 MODES = [Case("sms", model, mode) for model, family in FAMILIES.items() for mode in family.modes]
-SMS = [case for case in MODES if case.mode == "position"]
+SMS = [*(case for case in MODES if case.mode == "position"), Case("sms", "sts", keys=READ_ONLY)]
 KST, ROH, ARM = Case("kst"), Case("roh"), Case("roh", gateway=True)
 FULL_DUPLEX = Case("kst", keys="duplex: full")
 ALL = [*SMS, KST, FULL_DUPLEX, ROH, ARM]

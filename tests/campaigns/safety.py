@@ -59,7 +59,7 @@ def safety(share: float, rules: Sequence[Rule] = (*RULES, *COMMANDS)) -> bool:
     """Run every row and print the table. `share`: of the runs of the whole campaign."""
     kept = True
     head = ("travel", "false stops", "owed", "fired", "energised")
-    print(f"{'rule':44} {'case':34} {'runs':>5} " + " ".join(f"{name:>11}" for name in head))
+    print(f"{'rule':44} {'case':52} {'runs':>5} " + " ".join(f"{name:>11}" for name in head))
     for rule in rules:
         for case in rule.cases:
             figures = run(rule, case, max(1, round(share * rule.runs / len(rule.cases))))
@@ -73,4 +73,4 @@ def safety(share: float, rules: Sequence[Rule] = (*RULES, *COMMANDS)) -> bool:
 def line(rule: Rule, case: Case, figures: Figures) -> str:
     numbers = (figures.false_stops, figures.owed, figures.fired, figures.energised)
     cells = " ".join(f"{number:>11}" for number in (f"{figures.travel:.0f}", *numbers))
-    return f"{rule.name:44} {case!s:34} {figures.runs:>5} {cells}"
+    return f"{rule.name:44} {case!s:52} {figures.runs:>5} {cells}"

@@ -192,10 +192,12 @@ async def effort(case: Case, rng: random.Random, figures: Figures) -> None:
     async with bench.rig() as rig:
         await rig.enable("s1")
         await rig["s1"].move_to(bench.units[AWAY], speed=bench.units[SPEED], effort=30)
+        await asyncio.sleep(0.01)
         if servo.word(TORQUE_LIMIT) != 300:
             figures.broken.append("the effort of the goal was not written")
         await asyncio.sleep(rng.uniform(0, 0.2))
         await moved(rig, "s1", bench.units[HOME], bench.units[SPEED])
+        await asyncio.sleep(0.01)
         if servo.word(TORQUE_LIMIT) != own:
             figures.broken.append("the effort of the goal before caps this one")
 

@@ -14,7 +14,7 @@ from tests.campaigns.witness import Joint, WitnessLine, WitnessServo
 
 PING, READ, WRITE, REG_WRITE, ACTION, SYNC_READ, SYNC_WRITE = 1, 2, 3, 4, 5, 0x82, 0x83
 ALL = 0xFE
-END, MAJOR, MINOR, MIN_LIMIT, MAX_LIMIT, MAX_TORQUE, PHASE = 2, 3, 4, 9, 11, 16, 18
+END, MAJOR, MINOR, RESPONSE_LEVEL, MIN_LIMIT, MAX_LIMIT, MAX_TORQUE, PHASE = 2, 3, 4, 8, 9, 11, 16, 18
 TORQUE, GOAL, PWM, SPEED, TORQUE_LIMIT = 40, 42, 44, 46, 48
 POSITION, FLAG, STATUS, MOVING, GOAL_NOW = 56, 64, 65, 66, 67
 FULL_SPEED = 3000.0
@@ -222,7 +222,7 @@ class SmsLine(WitnessLine):
             servo.armed = params[0], params[1:]
         elif code == ACTION:
             servo.carry_out(now)
-        if servo.replies(now, self.rng):
+        if servo.replies(now, self.rng) and (code in (PING, READ) or servo.memory[RESPONSE_LEVEL]):
             yield node, status(node, servo.memory[STATUS], data)
 
 
