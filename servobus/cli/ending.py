@@ -19,7 +19,7 @@ from servobus.values import StopReport
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
-DONE = {"hold": "holds", "limp": "limp", "none": "limp", "park": "parked, limp", "stays": "stays energised"}
+DONE = {"hold": "holds", "limp": "limp", "none": "as it was", "park": "parked, limp", "stays": "stays energised"}
 """What an action that is confirmed has made of a servo."""
 
 

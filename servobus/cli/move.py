@@ -24,6 +24,8 @@ THEN = {
 }
 """What happens to an enabled servo when the command ends, as a table shows it."""
 
+HELD = "disabled, and may still hold: it does not tell its torque"
+
 Data = dict[str, Any]
 Rows = list[tuple[object, ...]]
 """The result of a command, for machines and for people. It is printed when the servos are left: until then it may still fail."""
@@ -129,14 +131,18 @@ def enable(options: Options, names: tuple[str, ...]) -> None:
 def disable(options: Options, names: tuple[str, ...]) -> None:
     """Switch torque off, and confirm it by reading back. Without a NAME all servos are disabled.
 
+    A servo that has no torque command (KST, a finger) goes on to hold where it is.
+
     Example: servobus disable elbow
     """
 
     async def action(context: RigContext) -> None:
         await context.rig.disable(*names)
-        disabled = context.rig.full_names(names)
-        data = {name: {"enabled": False} for name in disabled}
-        report(options.as_json, data, ("servo", "state"), [(name, "limp") for name in disabled])
+        states = context.rig.snapshot()
+        energised = {name: states[name].energised for name in context.rig.full_names(names)}
+        data = {name: {"enabled": False, "energised": energised[name]} for name in energised}
+        rows = [(name, "limp" if energised[name] is False else HELD) for name in energised]
+        report(options.as_json, data, ("servo", "state"), rows)
 
     on_rig(options, action, names, energises=True)
 

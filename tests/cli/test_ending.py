@@ -54,6 +54,17 @@ def document(out: str) -> Any:
 
 
 @every_protocol
+def test_disable_calls_limp_only_what_is_limp(protocol: str, tmp_path: Path) -> None:
+    """A KST servo and a finger have no torque command: disabled, they go on to hold."""
+    config = write_config(tmp_path / "rig.yaml", protocol)
+    limp = protocol in ("sts", "sms_cl")
+    status, out, _ = ended("disable", "-c", config)
+    assert (status, "limp" in out, "may still hold" in out) == (0, limp, not limp)
+    status, out, _ = ended("disable", "-c", config, "--json")
+    assert document(out) == {"arm/s1": {"enabled": False, "energised": False if limp else None}}
+
+
+@every_protocol
 def test_a_move_that_does_not_arrive_says_what_it_leaves(protocol: str, tmp_path: Path) -> None:
     config = write_config(tmp_path / "rig.yaml", protocol)
     status, out, err = ended("move", "-c", config, *SLOW, "--timeout", "0.3", "--json")

@@ -99,7 +99,7 @@ def test_enable_disable(call: Call) -> None:
     assert call.json("enable", "shoulder") == {"arm/shoulder": {"enabled": True, "then": "hold"}}
     assert call("disable") == 0
     assert call.out.count("limp") == 4
-    assert call.json("disable", "shoulder") == {"arm/shoulder": {"enabled": False}}
+    assert call.json("disable", "shoulder") == {"arm/shoulder": {"enabled": False, "energised": False}}
 
 
 def test_stop_and_clear_without_a_daemon(call: Call) -> None:
