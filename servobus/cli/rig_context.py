@@ -13,7 +13,7 @@ from typing import Any
 
 from servobus.cli.ending import of_command
 from servobus.cli.options import BusFacts, Options, RigContext
-from servobus.errors import InvalidRequest, LinkDown, NotSupported
+from servobus.errors import EStopped, InvalidRequest, LinkDown, NotSupported
 from servobus.remote.address import NoDaemon
 from servobus.remote.rig import RemoteRig, connect
 from servobus.rpc.socket_path import VARIABLE, find_socket
@@ -21,6 +21,7 @@ from servobus.values import Health, State, StopReport
 
 KEPT = "the daemon keeps it enabled; `servobus disable` disables it"
 GONE = "the connection to the daemon is lost: if it has died, nobody stops the servo; `servobus disable --direct` does"
+STOPPED = "the e-stop came: `servobus stop` tells what each servo confirmed"
 OTHERS = (
     "the daemon at {address} has no bus of {config}: which of the two is meant? Leave the config out (-c, SERVOBUS_CONFIG), or "
     "open its ports in this process (--direct); nothing was sent"
@@ -77,10 +78,11 @@ def _said_when_it_fails(rig: RemoteRig, names: Collection[str]) -> Iterator[None
     ending.energised, ending.has_daemon = lambda: dict.fromkeys(energised(), "stays"), True
     try:
         yield
-    except BaseException:
+    except BaseException as error:
+        stopped = isinstance(error, EStopped)  # what is known of the servos is older than what the e-stop does to them
         for name, state in energised().items():
-            confirmed = rig.connected and state.health is not Health.OFFLINE
-            ending.left[name] = StopReport("stays", False, confirmed, KEPT if rig.connected else GONE)
+            confirmed = rig.connected and not stopped and state.health is not Health.OFFLINE
+            ending.left[name] = StopReport("stays", False, confirmed, (STOPPED if stopped else KEPT) if rig.connected else GONE)
         raise
 
 

@@ -177,6 +177,20 @@ def test_a_daemon_keeps_what_a_failing_command_moved_and_the_command_says_so(tmp
         assert daemon.wait(10) == 0
 
 
+def test_a_move_that_an_e_stop_ends_does_not_say_that_a_limp_servo_stays_energised(tmp_path: Path) -> None:
+    with servobus("run", write_config(tmp_path / "rig.yaml", "sts", keys=", on_estop: limp")) as daemon:
+        until(daemon, "running")
+        assert ended("enable")[0] == 0
+        with servobus("move", *SLOW) as move:
+            while '"moving":true' not in ended("read", "--json")[1].replace(" ", ""):
+                assert move.poll() is None
+            assert ended("stop")[0] == 0
+            err = move.communicate(timeout=60)[1]
+        assert move.returncode == 1
+        assert "daemon keeps it" not in err
+        assert "arm/s1: left: stays energised" not in err
+
+
 def test_a_daemon_that_is_ended_twice_says_what_it_leaves(tmp_path: Path) -> None:
     with servobus("run", write_config(tmp_path / "rig.yaml", "sts", keys=PARK)) as daemon:
         until(daemon, "running")
