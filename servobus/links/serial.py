@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import fcntl
 import os
 import termios
 import time
@@ -71,7 +72,7 @@ class SerialLink:
         return transport
 
     def _open(self) -> serial.Serial:
-        """Open and configure the port; discards what arrived before.
+        """Open and configure the port, for this process alone (flock and TIOCEXCL); discards what arrived before.
 
         Linux raises DTR and RTS when a port is opened, pyserial raises them again, and servobus does not change them afterwards.
         So there is no edge that could reset a board or switch a transmitter.
@@ -89,9 +90,11 @@ class SerialLink:
             port.close()
             advice = "take out `rs485: true` (USB adapters switch by themselves)"
             raise LinkDown(f"{self.address}: its driver has no RS485 mode: {advice}") from None
-        if not is_pty(self.address):
+        if not is_pty(self.address):  # a PTY would remember TIOCEXCL after its close
             with suppress(OSError, ValueError):
                 port.set_low_latency_mode(True)
+            with suppress(OSError):  # flock keeps out programs that ask for it, this the others, but for root
+                fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
         return port
 
 

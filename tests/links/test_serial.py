@@ -209,3 +209,16 @@ async def test_the_line_is_raw() -> None:
         assert await pty.receive(2) == b"\r\n"
         assert pty.received() == b""
         transport.abort()
+
+
+TIOCGEXCL = 0x80045440
+"""Whether a terminal is open for one process alone (linux/tty.h); Python has no name for it."""
+
+
+async def test_a_pty_is_not_marked_for_one_process_alone() -> None:
+    """It would remember that after its close, and no other user could open it again. A real port forgets it."""
+    with plugged() as pty:
+        transport = await SerialLink(pty.path, 1_000_000).connect(Receiver())
+        state = fcntl.ioctl(transport.serial.fileno(), TIOCGEXCL, b"\0\0\0\0")
+        assert int.from_bytes(state, "little") == 0
+        transport.abort()
