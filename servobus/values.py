@@ -284,6 +284,7 @@ class StopTarget:
     setpoint: float | None = None  # the last position that was sent or held; None: not known
     reachable: bool = True  # False: known to be offline; it is written to, and not waited for
     energised: bool = False  # its torque was on when it was last read, whoever switched it on
+    leave_alone: bool = False  # an exit: what was not enabled may go on moving, as after its own restart
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,6 +141,7 @@ class Stops:
             setpoint=record.setpoint,
             reachable=record.node.health is not OFFLINE,
             energised=record.energised,
+            leave_alone=self.leaving and not (self.latched or record.enabled),
         )
 
     # Stops that are owed

@@ -31,6 +31,7 @@ from servobus.values import Outcome, ServoGoal, StopReport, StopTarget
 HOLDS = "KST has no torque command: the servo keeps holding"
 OFFLINE = "offline: nothing was sent; it goes no farther than its last setpoint"
 NOT_ENABLED = "it was not enabled, and rests: nothing was sent"
+LEFT_ALONE = "it was not enabled: nothing was sent"
 UNHEARD = "it was not enabled, and could not be read: whether it rests is not known"
 MAX_WAITS = 50
 """Setpoints in a row that a servo may let pass without coming nearer to the goal that it holds."""
@@ -147,9 +148,12 @@ def stop(settings: RequestSettings, targets: Sequence[tuple[CalibratedServo, Sto
     """Hold the servos, also those that are to be limp; see above. One that was not enabled is held where it moves."""
     reports = yield from _hold_all(settings, [(servo, target) for servo, target in targets if target.enabled])
     others = {servo: target for servo, target in targets if not target.enabled}
-    reports |= {servo.name: StopReport("none", False, False, UNHEARD) for servo in others}
+    for servo, target in others.items():
+        alone = target.leave_alone
+        reports[servo.name] = StopReport("none", False, alone, LEFT_ALONE if alone else UNHEARD)
     moving: list[tuple[CalibratedServo, StopTarget]] = []
-    for servo, readings in (yield from rest(settings, [servo for servo in others if others[servo].reachable])).items():
+    asked = [servo for servo, target in others.items() if target.reachable and not target.leave_alone]
+    for servo, readings in (yield from rest(settings, asked)).items():
         if rests(readings):
             reports[servo.name] = StopReport("none", False, True, NOT_ENABLED)
         elif not isinstance(readings, ServobusError):

@@ -28,6 +28,7 @@ REPEATS = 2
 """How often an unanswered write is sent, because a bad line may lose one."""
 HOLDS = "a ROH hand has no torque command: the finger keeps holding"
 NOT_ENABLED = "it was not enabled, and rests: nothing was written"
+LEFT_ALONE = "it was not enabled: nothing was sent"
 UNHEARD = "it was not enabled, and could not be read: whether it rests is not known"
 
 Targets = dict[Finger, StopTarget]
@@ -41,10 +42,13 @@ def stop(hands: Mapping[int, Hand], targets: Sequence[tuple[Finger, StopTarget]]
     """Return the plan of a stop; see above. A finger that was not enabled is held where it moves."""
     reports = yield from _hold_all(hands, {finger: target for finger, target in targets if target.enabled})
     others = {finger: target for finger, target in targets if not target.enabled}
-    reports |= {finger.name: StopReport("none", False, False, UNHEARD) for finger in others}
+    for finger, target in others.items():
+        alone = target.leave_alone
+        reports[finger.name] = StopReport("none", False, alone, LEFT_ALONE if alone else UNHEARD)
     moving: Targets = {}
     for unit, hand in hands.items():
-        asked = [finger for finger, target in others.items() if finger.node == unit and target.reachable]
+        awake = [finger for finger, target in others.items() if target.reachable and not target.leave_alone]
+        asked = [finger for finger in awake if finger.node == unit]
         resting = yield from _resting(hand, asked)
         reports |= {finger.name: StopReport("none", False, True, NOT_ENABLED) for finger, rested in resting.items() if rested}
         moving |= {finger: others[finger] for finger, rested in resting.items() if not rested}

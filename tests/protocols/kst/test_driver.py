@@ -250,6 +250,13 @@ def test_what_another_program_moves_is_stopped_too() -> None:
     assert bench.after(3).devices[0].position == stopped < 300
 
 
+def test_an_exit_leaves_alone_what_moves_after_a_restart() -> None:
+    bench = Bench(model=changed_model(max_steps_per_second=200.0))
+    bench.devices[0].goal = 800.0
+    report = bench.after(1).run(bench.driver.stop([StopTarget("pan", "hold", enabled=False, leave_alone=True)]))["pan"]
+    assert (report.action, report.written, report.confirmed, bench.frames()) == ("none", False, True, [])
+
+
 def test_what_is_not_known_to_rest_is_not_confirmed() -> None:
     bench = Bench()
     bench.devices[0].dead = True

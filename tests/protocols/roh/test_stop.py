@@ -50,6 +50,14 @@ def test_what_another_program_moves_is_stopped_too() -> None:
     assert bench.after(5).hand.fingers[1].position < 0.3 * 65535
 
 
+def test_an_exit_leaves_alone_what_moves_after_a_restart() -> None:
+    bench = Bench().enable("index")
+    bench.move(goal("index", 100, speed=20))
+    bench.frames()
+    report = bench.run(bench.driver.stop([target("index", enabled=False, leave_alone=True)]))["index"]
+    assert (report.action, report.written, report.confirmed, bench.frames()) == ("none", False, True, [])
+
+
 def test_what_is_not_known_to_rest_is_not_confirmed() -> None:
     bench = Bench().enable("index")
     report = bench.run(bench.driver.stop([target("index", enabled=False, reachable=False)]))["index"]
