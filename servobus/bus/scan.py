@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, Sequence
 
 from servobus.bus.service import BusService
-from servobus.engine.stats import Counter
+from servobus.engine.stats import Cause, Counter
 from servobus.errors import DeviceError, NotSupported, ReplyTimeout
 
+GARBLED_TRIES = 3
+"""Times an id is asked whose reply came garbled."""
 Hit = tuple[int, int, str | None, str | None, str | None, str]
 """Id, baud rate, model, product, firmware, note."""
 
@@ -36,6 +38,18 @@ async def scan(
 
 
 async def _ask(bus: BusService, node: int, rate: int, session: object) -> Hit | None:
+    """Ask one id. Silence is believed at once; an id whose reply came garbled is asked again."""
+    causes = bus.nodes.node(node).causes
+    for _ in range(GARBLED_TRIES):
+        garbled = causes[Cause.GARBLED]
+        if await _answers(bus, node, session):
+            return await _identity(bus, node, rate, session)
+        if causes[Cause.GARBLED] == garbled:
+            break
+    return None
+
+
+async def _answers(bus: BusService, node: int, session: object) -> bool:
     request = bus.driver.ping(node)
     echoes = bus.stats.counts[Counter.ECHOES]
     try:
@@ -43,12 +57,16 @@ async def _ask(bus: BusService, node: int, rate: int, session: object) -> Hit | 
     except ReplyTimeout:
         plain = request.plain()
         if plain is None or bus.stats.counts[Counter.ECHOES] == echoes:
-            return None
+            return False
         # A frame like the request came back: its echo, or a servo whose fault makes its reply look so. Ask so that they differ.
         try:
             await bus.ask(plain, even_if_offline=True, session=session, tries=1)
         except ReplyTimeout:
-            return None
+            return False
+    return True
+
+
+async def _identity(bus: BusService, node: int, rate: int, session: object) -> Hit:
     try:
         identity = await bus.perform(bus.driver.inspect(node), node, even_if_offline=True, session=session)
     except (ReplyTimeout, DeviceError):

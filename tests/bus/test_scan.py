@@ -83,3 +83,20 @@ async def test_a_line_whose_rate_is_set_elsewhere_is_scanned_at_that_rate_only()
         with pytest.raises(NotSupported, match="cannot change its baud rate"):
             await anext(scan(bus, [9600], [1]))
         assert (await anext(scan(bus, [bus.options.baudrate], [1])))[:2] == (1, 1)
+
+
+@virtual
+async def test_an_id_whose_reply_came_garbled_is_asked_again() -> None:
+    async with puppet_bus() as (bus, puppet, _, _):
+        garbled = [b"\x00\x13\x37", b"\xff\xff\x05\x02"]
+
+        def script(frame: bytes) -> Answers | None:
+            if frame[2] == 5:
+                return [(0.001, garbled.pop())] if garbled else None
+            return []
+
+        puppet.script = script
+        steps = [step async for step in scan(bus, [bus.options.baudrate], range(4, 7))]
+        assert [step[2] is not None for step in steps] == [False, True, False]
+        assert garbled == []
+        assert len([frame for frame in puppet.frames if frame[2] == 4]) == 1, "silence is believed at once"
