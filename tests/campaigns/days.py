@@ -32,8 +32,8 @@ GROUP_PERIOD, SINGLE_PERIOD = 0.1, 0.37
 """Seconds between two goals of all servos, and between two goals of one servo that are confirmed."""
 SAMPLE = 600.0
 """Virtual seconds between two looks at what is allocated."""
-MAX_GROWTH = 200
-"""Memory blocks an hour; less than an hour shows the tables of the start alone."""
+MAX_GROWTH = 2000
+"""Memory blocks over the whole time: a bus keeps up to 1024 durations of turns until it folds them into its histogram."""
 MAX_DRIFT = 1e-3
 """Seconds: what the rounding of ten million periods may add up to."""
 TEXT = """version: 1
@@ -92,7 +92,7 @@ class Days:
         }
 
     def kept(self) -> bool:
-        return not any(self.balance().values()) and self.drift < MAX_DRIFT and (self.hours < 1 or self.growth < MAX_GROWTH)
+        return not any(self.balance().values()) and self.drift < MAX_DRIFT and self.growth * self.hours < MAX_GROWTH
 
     def report(self) -> None:
         rate = self.hours * 3600 / self.seconds
