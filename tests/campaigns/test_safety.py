@@ -11,6 +11,7 @@ from tests.campaigns.safety import RULES, Rule
 ROWS = [pytest.param(rule, case, id=f"{rule.name}: {case}") for rule in RULES for case in rule.cases]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rule", "case"), ROWS)
 def test_nothing_moves_by_surprise(rule: Rule, case: Case) -> None:
     figures = safety.run(rule, case, 1)

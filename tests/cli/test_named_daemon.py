@@ -14,6 +14,8 @@ from servobus.cli import status_of
 from servobus.rpc.socket_path import find_socket
 from tests.cli.processes import LIMP, servobus, until
 
+pytestmark = pytest.mark.slow
+
 VERBS = [
     ("ping",),
     ("read",),

@@ -21,6 +21,8 @@ from servobus.simulation.pty import SimulatedPty
 from tests.protocols.sms.single_servo import packet_of
 from tests.protocols.sms.states import put, set_mode
 
+pytestmark = pytest.mark.slow
+
 TWO = ("s1: {id: 1, model: sts}", "s2: {id: 2, model: sts}")
 
 

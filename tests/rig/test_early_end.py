@@ -9,6 +9,8 @@ import pytest
 from servobus.rig.local import open_rig
 from tests.simulated_rigs import config
 
+pytestmark = pytest.mark.slow
+
 GREETINGS = {
     b"SSH-2.0-OpenSSH_9.2\r\n": "SSH-2.0-OpenSSH_9.2",
     b"\xff\xfd\x18\xff\xfb\x01": "telnet",

@@ -24,6 +24,7 @@ def torque(rig: LocalRig) -> int:
     return int(device(rig).get("torque_enable"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polls", POLLS)
 @pytest.mark.parametrize("protocol", FEETECH)
 @virtual

@@ -133,6 +133,7 @@ async def test_the_speed_is_kept_while_the_servo_follows() -> None:
         assert bus.clock() - began == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 @BY_POLLS
 def test_a_goal_after_a_restart_is_refused(poll: dict[str, float]) -> None:
     """0 to 2 s off, at any moment, whether a question fell into it or not. KST RS422, 3.5: then it is at its default position."""

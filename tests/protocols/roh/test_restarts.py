@@ -22,6 +22,8 @@ BY_POLLS = pytest.mark.parametrize("poll", POLLS.values(), ids=list(POLLS))
 BY_LINK = pytest.mark.parametrize("behind_arm", [False, True], ids=["direct", "behind an arm"])
 BY_SELF_TEST = pytest.mark.parametrize("self_test", [0, 1], ids=["no self-test", "self-test"])
 
+pytestmark = pytest.mark.slow
+
 
 def targets_written(hand: RohDevice) -> list[tuple[int, int]]:
     """Return the writes of targets, by the map of the hand."""
