@@ -15,6 +15,7 @@ from servobus.rig.local import LocalRig, open_rig
 from servobus.values import Outcome
 from tests.simulated_rigs import config, pty_rig
 from tests.virtual_time import virtual
+from tests.waiting import until
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,14 @@ MATRIX = {
 }
 
 Verb = tuple[Callable[[LocalRig], Awaitable[object]], Callable[[Any], bool]]
+
+
+async def clear_once_stopped(rig: LocalRig) -> tuple[str, ...]:
+    """Release the e-stop when every servo has confirmed it: a stop that was lost is repeated, on each of these lines."""
+    await until(lambda: not rig.buses["arm"].stops.owed)
+    return await rig.clear()
+
+
 VERBS: dict[str, Verb] = {
     "ping": (lambda rig: rig.ping("s1"), lambda status: status == 0),
     "identify": (lambda rig: rig.identify("s2"), lambda result: getattr(result, "model", None) == "sts"),
@@ -65,7 +74,7 @@ VERBS: dict[str, Verb] = {
     ),
     "disable": (lambda rig: rig.disable("s2"), lambda done: done is None),
     "stop": (lambda rig: rig.stop(), lambda reports: set(reports) == {"arm/s1", "arm/s2", "arm/s3"}),
-    "clear": (lambda rig: rig.clear(), lambda owed: isinstance(owed, tuple)),
+    "clear": (clear_once_stopped, lambda owed: owed == ()),
 }
 
 KST_VERBS: dict[str, Verb] = {

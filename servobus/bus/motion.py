@@ -14,7 +14,7 @@ from functools import partial
 from servobus.bus.limits import check_goal
 from servobus.bus.records import ServoRecord
 from servobus.bus.requests import BusParts, Requests
-from servobus.bus.stops import TOLERANCE_STEPS, Stops
+from servobus.bus.stops import Stops
 from servobus.engine.coalescer import Ticket
 from servobus.engine.job import JobKind
 from servobus.engine.stats import Counter
@@ -165,7 +165,7 @@ class Motion:
         """
         self.refuse()
         record = self._parts.records[servo]
-        if record.enabled and not record.arrived(self._near(servo)):
+        if record.enabled and not record.arrived(self._stops.near(servo)):
             await self._stops.hold([servo])
             self.refuse()
         generation = record.generation
@@ -201,7 +201,7 @@ class Motion:
             raise Busy(SESSION, bus=self._parts.name, servo=servo)
         self._parts.scheduler.drop_goals(self._disabled, {servo})
         record.disable()
-        if not record.arrived(self._near(servo)):
+        if not record.arrived(self._stops.near(servo)):
             record.cut = NotEnabled("the servo was disabled before it arrived at its goal")
         plan = self._parts.driver.disable(servo)
         report = await self._requests.perform(plan, record.node.id, servo=servo, even_if_offline=True, patience=OTHERS_PATIENCE)
@@ -261,7 +261,7 @@ class Motion:
         """
         parts, record = self._parts, self._parts.records[servo]
         moving = record.enabled
-        near = self._near(servo) if tolerance is None else tolerance
+        near = self._stops.near(servo) if tolerance is None else tolerance
         end = parts.clock() + timeout
         before: State | None = None
         step = parts.driver.step(servo)
@@ -291,9 +291,6 @@ class Motion:
             raise NotEnabled(message, bus=self._parts.name, servo=record.name)
         if record.cut is not None:
             raise record.cut.at(bus=self._parts.name, servo=record.name)
-
-    def _near(self, servo: str) -> float:
-        return TOLERANCE_STEPS * self._parts.driver.step(servo)
 
 
 def _rests(state: State, before: State | None, step: float) -> bool:

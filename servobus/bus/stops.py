@@ -39,6 +39,7 @@ ESTIMATE_AGE = 0.1
 PAUSE = 0.05
 """Seconds between two stops of a servo that answers and does not confirm."""
 TOLERANCE_STEPS = 10
+"""Steps from its goal within which a servo has arrived."""
 
 ActionOf = Callable[[ServoRecord], str]
 
@@ -64,6 +65,10 @@ class Stops:
     @property
     def _kind(self) -> JobKind:
         return JobKind.ESTOP if self.latched or self.leaving else JobKind.MOTION
+
+    def near(self, servo: str) -> float:
+        """Return how far from its goal, in its unit, a servo counts as arrived."""
+        return TOLERANCE_STEPS * self._parts.driver.step(servo)
 
     async def stop(self) -> dict[str, StopReport]:
         """E-stop this bus: drop everything that moves, stop every servo as its `on_estop` says (park: holds first)."""
@@ -114,8 +119,7 @@ class Stops:
         future: asyncio.Future[dict[str, StopReport]] = self._loop.create_future()
         job = Job(future, math.inf, plan=plan, node=records[0].node.id, kind=self._kind, tries=1)
         for record, target in zip(records, targets, strict=True):
-            near = TOLERANCE_STEPS * self._parts.driver.step(record.name)
-            record.hold_at(None, record.cut if record.arrived(near) else cut)
+            record.hold_at(None, record.cut if record.arrived(self.near(record.name)) else cut)
             if target.kind == "limp":
                 record.disable()
         try:

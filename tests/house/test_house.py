@@ -14,7 +14,7 @@ from tests.house.sources import PRODUCT, ROOT, SCRIPTS, TESTS, parsed
 SOURCES = [*PRODUCT, *TESTS, *SCRIPTS]
 PAGE_PATTERNS = ("*.md", "docs/*.md", "tests/*.md", "config/*.yaml", "servobus/**/*.yaml")
 PAGES = [path for pattern in PAGE_PATTERNS for path in sorted(ROOT.glob(pattern))]
-MAX_FILE, MAX_FUNCTION, MAX_PRODUCT = 400, 40, 25_000
+MAX_FILE, MAX_FUNCTION, MAX_PRODUCT = 400, 40, 24_600
 """Lines: of a file and of the package at most so many, of a function fewer. A smaller package lowers the last one."""
 
 RETIRED = frozenset(

@@ -14,13 +14,10 @@ from servobus.protocols.base import Plan, ask
 from servobus.protocols.kst.codec import Command, decode_position
 from servobus.protocols.kst.requests import Read, RequestSettings
 from servobus.protocols.kst.servo import CalibratedServo
+from servobus.protocols.rest import middle, read_twice
 
-PAUSE = 0.03
-"""Seconds between two readings that show whether a servo rests."""
 REST = 1
-"""Steps by which they may differ: less than a servo travels meanwhile at 7 deg/s."""
-ROUNDS = 3
-"""How often a servo that still moves is read so."""
+"""Steps by which two readings of a servo at rest may differ: less than it travels meanwhile at 7 deg/s."""
 
 Readings = tuple[int, int] | ServobusError
 """The last two readings of a servo in steps, or why it could not be read."""
@@ -44,21 +41,18 @@ def locate(settings: RequestSettings, servo: CalibratedServo, *, once: bool = Fa
     if abs(first - second) <= servo.travel.jitter:
         return servo.believe(second, sure=True)
     third = yield from ask(request)
-    return servo.believe(sorted((first, second, third))[1], sure=True)
+    return servo.believe(middle(first, second, third), sure=True)
 
 
 def rest(settings: RequestSettings, servos: Sequence[CalibratedServo]) -> Plan[dict[CalibratedServo, Readings]]:
-    """Return two readings of each servo, with a pause between. They are repeated a few times for one that moves meanwhile."""
-    results: dict[CalibratedServo, Readings] = {}
-    waiting = list(servos)
-    for _ in range(ROUNDS):
-        before = yield from _read_all(settings, waiting, results, pause=PAUSE)
-        now = yield from _read_all(settings, list(before), results)
-        results |= {servo: (before[servo], reading) for servo, reading in now.items()}
-        waiting = [servo for servo in now if not rests(results[servo])]
-        if not waiting:
-            break
-    return results
+    """Return two readings of each servo, see `protocols.rest`, or why it could not be read."""
+    failed: dict[CalibratedServo, Readings] = {}
+
+    def read(some: Sequence[CalibratedServo], pause: float) -> Plan[dict[CalibratedServo, int]]:
+        return _read_all(settings, some, failed, pause)
+
+    twice = yield from read_twice(servos, read, lambda _, before, now: rests((before, now)))
+    return {**twice, **failed}
 
 
 def rests(readings: Readings) -> bool:
@@ -70,8 +64,7 @@ def _read_all(
     settings: RequestSettings,
     servos: Sequence[CalibratedServo],
     failed: dict[CalibratedServo, Readings],
-    *,
-    pause: float = 0.0,
+    pause: float,
 ) -> Plan[dict[CalibratedServo, int]]:
     """Read each servo. `pause`: seconds of silence after the last one."""
     readings: dict[CalibratedServo, int] = {}

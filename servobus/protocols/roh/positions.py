@@ -10,17 +10,14 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from servobus.protocols.base import Plan
+from servobus.protocols.rest import middle, read_twice
 from servobus.protocols.roh.finger import Finger
 from servobus.protocols.roh.hand import Hand
 
-PAUSE = 0.03
-"""Seconds between two readings that show whether a finger rests."""
 REST_STEPS = 1.0
-"""Steps of a finger (0.1 % or 0.1 degrees) by which they may differ."""
+"""Steps of a finger (0.1 % or 0.1 degrees) by which two readings of one at rest may differ."""
 CLOSE_STEPS = 50.0
 """Steps by which two readings of a finger that moves may differ, one turn apart."""
-ROUNDS = 3
-"""How often fingers that still move are read so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +52,7 @@ def locate(hand: Hand, expected: Mapping[Finger, int | None]) -> Plan[dict[Finge
         return places[1]
     third = yield from read_fingers(hand, fingers)
     places.append({finger: reading.position for finger, reading in third.items()})
-    return {finger: sorted(each[finger] for each in places)[1] for finger in fingers}
+    return {finger: middle(*(each[finger] for each in places)) for finger in fingers}
 
 
 def _is_close(finger: Finger, expected: int | None, position: int) -> bool:
@@ -63,17 +60,12 @@ def _is_close(finger: Finger, expected: int | None, position: int) -> bool:
 
 
 def rest(hand: Hand, fingers: Collection[Finger]) -> Plan[dict[Finger, tuple[Reading, Reading]]]:
-    """Return two readings of each finger, with a pause between. They are repeated a few times for those that move meanwhile."""
-    waiting = list(fingers)
-    results: dict[Finger, tuple[Reading, Reading]] = {}
-    for _ in range(ROUNDS):
-        before = yield from read_fingers(hand, waiting, pause=PAUSE)
-        now = yield from read_fingers(hand, waiting)
-        results |= {finger: (before[finger], now[finger]) for finger in waiting}
-        waiting = [finger for finger in waiting if not rests(finger, *results[finger])]
-        if not waiting:
-            break
-    return results
+    """Return two readings of each finger, see `protocols.rest`."""
+
+    def read(some: Sequence[Finger], pause: float) -> Plan[dict[Finger, Reading]]:
+        return read_fingers(hand, some, pause=pause)
+
+    return (yield from read_twice(list(fingers), read, rests))
 
 
 def rests(finger: Finger, before: Reading, now: Reading) -> bool:
